@@ -1,1 +1,1 @@
-"""Checks of controllers and plants against their contracts; each failure says what to change."""
+"""Checks of controllers and plants against their contracts; each failure names the remedy."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import replace
 from typing import Any, Final
 
@@ -45,7 +46,7 @@ def check_controller(
         found: called with each finding.
 
     Returns:
-        What each check found; each failure says what to change.
+        The finding of each check; each failure names the remedy.
 
     Raises:
         ConfigurationError: the controller cannot be loaded; it is a ValueError.
@@ -68,7 +69,7 @@ class ControllerChecks:
         """Prepare the checks.
 
         Args:
-            entry: what builds the controller.
+            entry: of the controller.
             rig: makes an arm of n joints and m features.
         """
         self.entry, self.rig, self.steps = entry, rig, STEPS
@@ -77,7 +78,7 @@ class ControllerChecks:
         self._printed = ""
 
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
-        """Yield what each check finds."""
+        """Yield the finding of each check."""
         return findings_of(self.checks(), self.folder, begin)
 
     def checks(self) -> list[Check]:
@@ -127,9 +128,9 @@ class ControllerChecks:
             )
 
     def diagnostics(self) -> None:
-        """What is logged are named numbers and a Jacobian."""
+        """The log gets named numbers and a Jacobian."""
         driver = self._driver().begin()
-        driver.step()
+        driver.run(1)
         controller, spec = driver.controller, driver.rig.spec
         named: Any = controller.diagnostics()
         try:
@@ -171,13 +172,13 @@ class ControllerChecks:
         new = attributes(fresh.controller)
         first = fresh.run(self.steps)
         used.begin().run(self.steps)
-        used.conditions = Conditions()
+        used.seed = 0
         kept = differing(new, attributes(used.begin().controller))
         again = used.run(self.steps)
         if not np.array_equal(first, again):
             name = f" in self.{', self.'.join(kept)}" if kept else ""
             raise CheckFailed(
-                f"{at(used.controller.reset)}: reset keeps what an earlier run left{name}; set it anew there"
+                f"{at(used.controller.reset)}: reset keeps values of an earlier run{name}; set it anew there"
             )
 
     def separate(self) -> None:
@@ -186,8 +187,8 @@ class ControllerChecks:
         one, other = self._driver().begin(), self._driver(seed=1).begin()
         together = []
         for _ in range(self.steps):
-            together.append(one.step())
-            other.step()
+            together.append(one.run(1)[0])
+            other.run(1)
         if not np.array_equal(alone, together):
             raise CheckFailed(
                 "two controllers in one process disturb each other through a variable of the module or the class; "
@@ -202,10 +203,11 @@ class ControllerChecks:
             saved = driver.controller.save()
         except Exception as error:  # noqa: BLE001 - of the user's attributes
             return f"it cannot be saved and continued in several ways: {type(error).__name__}: {error}"
-        state = driver.q, driver.observation, driver.rng.bit_generator.state, driver.k
+        plant, rollout = driver.rig.save(), copy(driver.rollout)
         first = driver.run(2)
         driver.controller.restore(saved)
-        driver.q, driver.observation, driver.rng.bit_generator.state, driver.k = state
+        driver.rig.restore(plant)
+        driver.rollout = rollout
         if not np.array_equal(first, driver.run(2)):
             raise CheckFailed(
                 "after restore it commands differently; save and restore must cover all that step changes"
@@ -217,7 +219,7 @@ class ControllerChecks:
         self._driver(at_goal=True).begin().run(self.steps)
 
     def lost_feature(self) -> None:
-        """Commands are finite while the feature is not seen, also from the start."""
+        """Commands are finite while the feature is lost, also from the start."""
         for lost in (range(1, 4), range(3)):
             self._driver(lost=lost).begin().run(min(self.steps, 6))
 
@@ -259,9 +261,9 @@ class ControllerChecks:
     def approach(self) -> str | None:
         """It brings the feature nearer to its target."""
         driver = self._driver().begin()
-        before = driver.error()
+        before = driver.rig.error()
         driver.run(APPROACH if self.steps == STEPS else self.steps)
-        after, seconds = driver.error(), driver.k * PERIOD
+        after, seconds = driver.rig.error(), driver.rollout.k * PERIOD
         if after <= before:
             return None
         hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""
@@ -292,7 +294,8 @@ class ControllerChecks:
             knowledge = replace(knowledge, preview=preview)
         return self.entry.build(default_config(self.entry), knowledge), rig
 
-    def _driver(self, **conditions: Any) -> Driver:  # noqa: ANN401 - those of `Conditions`
+    def _driver(self, seed: int = 0, **conditions: Any) -> Driver:  # noqa: ANN401 - those of `Conditions`
         chosen = Conditions(**conditions)
         controller, rig = self._build(chosen.preview)
-        return Driver(controller, rig, chosen)
+        rig.conditions = chosen
+        return Driver(controller, rig, seed)

@@ -24,7 +24,7 @@ STEPS: Final = 6
 SHARE: Final = 0.5  # of the joint-speed limits, within which commands are drawn
 JACOBIAN_STEPS: Final = 4  # of a slow motion that the true Jacobian has to predict
 JACOBIAN_TOLERANCE: Final = 0.05  # of the motion of the feature
-MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which nothing can be told of the Jacobian
+MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
 
 
 def check_plant(
@@ -42,7 +42,7 @@ def check_plant(
         found: called with each finding.
 
     Returns:
-        What each check found; each failure says what to change.
+        The finding of each check; each failure names the remedy.
 
     Raises:
         ConfigurationError: there is no such plant, or it cannot be loaded; it is a ValueError.
@@ -64,13 +64,13 @@ class PlantChecks:
         self.entry, self._plant = entry, list[Plant]()
 
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
-        """Yield what each check finds; the plant is closed at the end."""
+        """Yield the finding of each check; the plant is closed at the end."""
         try:
             build = self.entry.build
             yield from findings_of(self.checks(), folder_of(build.make if isinstance(build, Build) else build), begin)
         finally:
             for plant in self._plant:
-                with contextlib.suppress(Exception):  # the check of `close` has told of it
+                with contextlib.suppress(Exception):  # the check of `close` has reported it
                     plant.close()
 
     def checks(self) -> list[Check]:
@@ -93,7 +93,7 @@ class PlantChecks:
         self._plant.append(self._build())
 
     def run(self) -> None:
-        """Time counts control periods, and what is seen has the sizes of the spec."""
+        """Time counts control periods, and observations have the sizes of the spec."""
         plant = self._plant[0]
         spec = plant.spec
         if spec.period != PERIOD:
@@ -151,7 +151,7 @@ class PlantChecks:
             observation = plant.step(Command(0.05 * plant.spec.joint_velocity_limit))
         after = plant.truth()
         if before.jacobian is None or after.jacobian is None:
-            return "the plant does not tell its true Jacobian, so the error of estimates cannot be logged"
+            return "the plant does not know its true Jacobian, so the error of estimates cannot be logged"
         moved = after.feature - before.feature
         wrong = np.linalg.norm(moved - (before.jacobian + after.jacobian) / 2 @ (observation.joint_position - start))
         size = float(np.linalg.norm(moved))

@@ -1,4 +1,4 @@
-"""What checks find: a list of findings, each ok, failed or a note."""
+"""Findings of checks: each ok, failed or a note."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ WIDTH: Final = 14  # of the names of checks, in print
 
 
 class Finding(NamedTuple):
-    """What one check found."""
+    """The finding of one check."""
 
     check: str
-    """what was checked, in one or two words"""
+    """the checked property, in one or two words"""
     verdict: Verdict
     """a note is no defect, but worth knowing"""
     text: str = ""
-    """what is wrong, where, and what to change; empty if it is ok"""
+    """the defect, its place and the remedy; empty if it is ok"""
 
     def __str__(self) -> str:
         """Return it as a line."""
@@ -33,7 +33,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What the checks of one subject found."""
+    """The findings about one subject."""
 
     subject: str
     findings: tuple[Finding, ...]
@@ -56,7 +56,7 @@ class Report:
 
 
 class CheckFailed(Exception):
-    """A check found a defect; the message says what to change."""
+    """A check found a defect; the message names the remedy."""
 
 
 class Check(NamedTuple):
@@ -66,11 +66,11 @@ class Check(NamedTuple):
     carry_out: Callable[[], str | None]
     """returns a note or nothing, and raises `CheckFailed`"""
     needs: tuple[str, ...] = ()
-    """checks without which this one tells nothing new"""
+    """checks without which this one finds nothing new"""
 
 
 def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], None]) -> Iterator[Finding]:
-    """Carry out checks one after the other and yield what each finds.
+    """Carry out checks one after the other and yield the finding of each.
 
     Args:
         checks: a check is left out if one that it needs was not ok.
@@ -89,7 +89,7 @@ def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], No
             yield Finding(check.name, "failed", str(failure))
         except ConfigurationError as error:
             yield Finding(check.name, "failed", str(error))
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code does
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
             yield Finding(check.name, "failed", describe_at(error, folder) + _remedy(error))
         else:
             good.add(check.name)
@@ -98,7 +98,7 @@ def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], No
 
 def _remedy(error: BaseException) -> str:
     if isinstance(error, ValueError) and "read-only" in str(error):
-        return "; what step is given must not be changed: work on a copy, such as e = reference[0].copy()"
+        return "; the arguments of step must not be changed: work on a copy, such as e = reference[0].copy()"
     if isinstance(error, FloatingPointError):
         return "; such a number ends a run: guard the division, or the power, against it"
     if isinstance(error, SystemExit):

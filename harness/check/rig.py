@@ -9,9 +9,9 @@ import traceback
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, final
 
 import numpy as np
 
@@ -20,19 +20,36 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.harness.check.report import CheckFailed
 from servobench.harness.config.source import PACKAGES, show
+from servobench.harness.run.loop import LoopSettings, begin, periods
+from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.signals import Command, Observation, PlantSpec
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 PERIOD: Final = 0.05  # [s]
 PREVIEW: Final = 10  # [rows]
+MAX_PERIODS: Final = 1000  # of a run
 BEND: Final = 0.02  # [1/rad²]
 MODEL_ERROR: Final = 1.05  # nominal over true Jacobian
 NOISE: Final = 1e-3  # [m] of the feature
 SMALL_TRAINING: Final = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 
 
-class Rig:
-    """An arm of n joints whose camera sees m features; the same numbers for the same sizes."""
+@dataclass
+class Conditions:
+    """The conditions of a run on the arm."""
+
+    preview: int = PREVIEW  # [rows]
+    scale: float = 1.0  # of features and reference
+    lost: range = range(0)  # periods in which the feature is lost
+    at_goal: bool = False  # whether the arm stands at its goal and is not moved
+
+
+class Rig(Plant):
+    """An arm of n joints whose camera measures m features; the same numbers for the same sizes.
+
+    Attributes:
+        conditions: of the runs.
+    """
 
     def __init__(self, n: int, m: int, seed: int = 0) -> None:
         """Make the arm.
@@ -42,6 +59,7 @@ class Rig:
             m: number of features.
             seed: of the arm's numbers.
         """
+        self.conditions = Conditions()
         rng = np.random.default_rng([n, m, seed])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
@@ -57,15 +75,15 @@ class Rig:
         """Return the true Jacobian (..., m, n) [m/rad] at joint positions (..., n) [rad]."""
         return np.asarray(self.A * (1.0 + 3.0 * BEND * q**2)[..., None, :])
 
-    def nominal_jacobian(self, q: FloatArray) -> FloatArray:
+    def model_jacobian(self, q: FloatArray) -> FloatArray:
         """Return the Jacobian of the nominal model, as `jacobian`."""
         return MODEL_ERROR * self.jacobian(q)
 
     def knowledge(self, *, truth: bool = False, preview: int = PREVIEW) -> RobotKnowledge:
-        """Return what a controller may know; with `truth` also what only an upper bound may."""
+        """Return the knowledge of a controller; with `truth` also that of an upper bound."""
         n = self.spec.n
         known = RobotKnowledge(
-            self.spec, preview, self.nominal_jacobian, region=(np.full(n, -1.0), np.full(n, 1.0)), train=self._train
+            self.spec, preview, self.model_jacobian, region=(np.full(n, -1.0), np.full(n, 1.0)), train=self._train
         )
         if not truth:
             return known
@@ -73,22 +91,38 @@ class Rig:
             known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=Delays(0.0, 0.0, 0.0)
         )
 
-    def seen(self, q: FloatArray, k: int, rng: np.random.Generator, *, valid: bool = True) -> Observation:
-        """Return what is observed in period k at joint positions q (n,) [rad]."""
-        noisy = self.feature(q) + rng.normal(scale=NOISE, size=self.spec.m)
-        return Observation(k * PERIOD, q, noisy, valid)
+    def reset(self, seed: int) -> Observation:
+        """See `Plant.reset`; the arm stands at its start, or at its goal."""
+        self._rng, self._k = np.random.default_rng(seed), 0
+        self.q = self.goal if self.conditions.at_goal else self.start
+        return self._observe()
 
-    def move(self, q: FloatArray, joint_velocity: FloatArray) -> FloatArray:
-        """Return the joint positions a period later, (n,) [rad]."""
-        limit = self.spec.joint_velocity_limit
-        moved = q + np.clip(joint_velocity, -limit, limit) * PERIOD
-        return np.asarray(np.clip(moved, self.spec.joint_lower, self.spec.joint_upper))
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`; an arm at its goal stays there."""
+        if not self.conditions.at_goal:
+            limit = self.spec.joint_velocity_limit
+            moved = self.q + np.clip(command.joint_velocity, -limit, limit) * PERIOD
+            self.q = np.clip(moved, self.spec.joint_lower, self.spec.joint_upper)
+        self._k += 1
+        return self._observe()
 
-    def reference(self, preview: int = PREVIEW) -> FloatArray:
-        """Return the reference (1 + preview, m) [m] of a target at rest; it cannot be written."""
-        rows = np.tile(self.feature(self.goal), (1 + preview, 1))
-        rows.flags.writeable = False
-        return rows
+    def _observe(self) -> Observation:
+        feature, time = self.feature(self.q), self._k * PERIOD
+        if self.conditions.at_goal:
+            return Observation(time, self.q, feature)
+        noisy = feature + self._rng.normal(scale=NOISE, size=self.spec.m)
+        return Observation(time, self.q, self.conditions.scale * noisy, self._k not in self.conditions.lost)
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        return Truth(self.feature(self.q), self.jacobian(self.q))
+
+    def close(self) -> None:
+        """See `Plant.close`; nothing is held."""
+
+    def error(self) -> float:
+        """Return the true distance from the goal [m]."""
+        return float(np.linalg.norm(self.feature(self.goal) - self.feature(self.q)))
 
     def _train(self, config: TrainingConfig) -> TrainedNetworks:
         from servobench.controllers.networks.config import ControllerTraining, JacobianTraining  # noqa: PLC0415
@@ -98,76 +132,63 @@ class Rig:
             "jacobian": JacobianTraining(centres=6, **SMALL_TRAINING),  # type: ignore[arg-type]
             "controller": ControllerTraining(hidden=6, **SMALL_TRAINING),  # type: ignore[arg-type]
         }
-        return train(replace(config, **parts), self.nominal_jacobian, self.spec)
+        return train(replace(config, **parts), self.model_jacobian, self.spec)
 
     def _symbolic(self, q: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
         return type(q)(self.A) @ (q + BEND * q * q * q)
 
 
-@dataclass
-class Conditions:
-    """What a run on the made-up arm meets."""
-
-    seed: int = 0  # of the noise, and what `reset` is given
-    preview: int = PREVIEW  # [rows]
-    scale: float = 1.0  # of features and reference
-    lost: range = range(0)  # periods in which the feature is not seen
-    at_goal: bool = False  # whether the arm stands at its goal and is not moved
-
-
-@dataclass
 class Driver:
-    """Drives a controller; a run can be continued after a part of its periods."""
+    """Drives a controller on a rig; a run can be continued after a part of its periods."""
 
-    controller: Controller
-    rig: Rig
-    conditions: Conditions = field(default_factory=Conditions)
-    k: int = 0
-    times: list[float] = field(default_factory=list)  # [s] of each step
+    def __init__(self, controller: Controller, rig: Rig, seed: int = 0) -> None:
+        """Take controller, rig, and the seed of the noise, which `reset` gets, too."""
+        self.controller, self.rig, self.seed = controller, rig, seed
+        self.times: list[float] = []  # [s] of each step
 
     def begin(self) -> Driver:
         """Reset the controller."""
-        self.rng = np.random.default_rng(self.conditions.seed)
-        self.q = self.rig.goal if self.conditions.at_goal else self.rig.start
-        self.k = 0
-        self.observation = self._observe()
-        self.controller.reset(self.observation, self.conditions.seed)
+        conditions, goal = self.rig.conditions, self.rig.feature(self.rig.goal)
+        desired = conditions.scale * np.tile(goal, (MAX_PERIODS + conditions.preview, 1))
+        desired.flags.writeable = False
+        length = LoopSettings(MAX_PERIODS, conditions.preview)
+        self.rollout = begin(self.rig, self.controller, desired, length, (self.seed, self.seed))
         return self
 
-    def run(self, periods: int) -> FloatArray:
-        """Return the commands (periods, n) [rad/s] of the next periods."""
-        return np.array([self.step() for _ in range(periods)])
-
-    def step(self) -> FloatArray:
-        """Return the command (n,) [rad/s] of a period, and go on to the next.
+    def run(self, count: int) -> FloatArray:
+        """Return the commands (count, n) [rad/s] of the next periods.
 
         Raises:
-            CheckFailed: it is no command of n finite numbers, or `step` changed what it was given.
+            CheckFailed: one is no command of n finite numbers, or `step` changed its arguments.
         """
-        reference = self.conditions.scale * self.rig.reference(self.conditions.preview)
+        commands = []
+        for period in islice(periods(self.rollout, _Watched(self.controller, self.rig.spec.n)), count):
+            self.times.append(1e-9 * period.nanoseconds[0])
+            commands.append(period.command.joint_velocity)
+        return np.array(commands)
+
+
+@final
+class _Watched(Controller):
+    """A controller whose steps must return a command and leave their arguments as they are."""
+
+    def __init__(self, controller: Controller, n: int) -> None:
+        self._controller, self._n = controller, n
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """See `Controller.reset`."""
+        self._controller.reset(observation, seed)
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`."""
+        reference = reference.copy()  # whose flag a controller can set, as that of any array of its own
         reference.flags.writeable = False
-        given = _bytes(self.observation, reference)
-        began = perf_counter()
-        command = self.controller.step(self.observation, reference)
-        self.times.append(perf_counter() - began)
-        u = _velocity(command, self.controller, self.rig.spec.n)
-        if _bytes(self.observation, reference) != given:
-            raise CheckFailed(f"{at(self.controller.step)}: step changes what it is given; work on a copy")
-        if not self.conditions.at_goal:
-            self.q = self.rig.move(self.q, u)
-        self.k += 1
-        self.observation = self._observe()
-        return u
-
-    def error(self) -> float:
-        """Return the true distance from the goal [m]."""
-        return float(np.linalg.norm(self.rig.feature(self.rig.goal) - self.rig.feature(self.q)))
-
-    def _observe(self) -> Observation:
-        if self.conditions.at_goal:
-            return Observation(self.k * self.rig.spec.period, self.q, self.rig.feature(self.q))
-        seen = self.rig.seen(self.q, self.k, self.rng, valid=self.k not in self.conditions.lost)
-        return Observation(seen.time, seen.joint_position, self.conditions.scale * seen.feature, seen.feature_valid)
+        given = _bytes(observation, reference)
+        command = self._controller.step(observation, reference)
+        _check_command(command, self._controller, self._n)
+        if _bytes(observation, reference) != given:
+            raise CheckFailed(f"{at(self._controller.step)}: step changes its arguments; work on a copy")
+        return command
 
 
 def at(method: Any) -> str:  # noqa: ANN401 - a method or a function
@@ -180,7 +201,7 @@ def _bytes(observation: Observation, reference: FloatArray) -> tuple[bytes, ...]
     return observation.joint_position.tobytes(), observation.feature.tobytes(), reference.tobytes()
 
 
-def _velocity(command: object, controller: Controller, n: int) -> FloatArray:
+def _check_command(command: object, controller: Controller, n: int) -> None:
     where = at(controller.step)
     if not isinstance(command, Command):
         raise CheckFailed(
@@ -191,7 +212,6 @@ def _velocity(command: object, controller: Controller, n: int) -> FloatArray:
         raise CheckFailed(
             f"{where}: the command must have shape ({n},), a number for each joint, got {command.joint_velocity.shape}"
         )
-    return command.joint_velocity
 
 
 @dataclass
@@ -204,7 +224,7 @@ class Draws:
 
 @contextlib.contextmanager
 def watching_draws(folder: Path) -> Iterator[Draws]:
-    """Yield what is drawn without a seed within the context.
+    """Yield the places and generators of draws without a seed within the context.
 
     Args:
         folder: that of the user's code.
@@ -231,7 +251,7 @@ def watching_draws(folder: Path) -> Iterator[Draws]:
 
 
 def _states() -> dict[str, object]:
-    shared: Any = np.random.get_state(legacy=False)  # noqa: NPY002 - it is looked at, not used
+    shared: Any = np.random.get_state(legacy=False)  # noqa: NPY002 - it is compared, not used
     return {"numpy.random": (shared["state"]["key"].tobytes(), shared["state"]["pos"]), "random": random.getstate()}
 
 
@@ -258,4 +278,4 @@ def _same(one: object, other: object) -> bool:
             return bool(one == other)
     except ValueError:  # arrays within
         return repr(one) == repr(other)
-    return True  # nothing can be told of objects of other kinds
+    return True  # objects of other kinds cannot be compared

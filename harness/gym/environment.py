@@ -14,7 +14,7 @@ import numpy.typing as npt
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.gym.spaces import Floats32, View
+from servobench.harness.gym.spaces import Floats32, Spaces
 from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
 from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest, read_mismatch
@@ -36,7 +36,7 @@ MARK: Final = (40, 40, 40)  # red, green, blue
 def resolve_environment(
     plant: str, task: str, mismatch: str, robot: str, sensing: str, settings: Mapping[str, Mapping[str, Any]] | None
 ) -> ResolvedRun:
-    """Return what the runs of an environment have in common, with seed 0; arguments as in `ServoEnv`.
+    """Return the resolved run of an environment, with seed 0; arguments as in `ServoEnv`.
 
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
@@ -62,8 +62,8 @@ def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
 class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     """One run of a task, of which each episode draws a new robot, target and noise.
 
-    An action is a joint velocity as a share of the joints' limits, held for a control period; `View` says what the
-    policy sees. The reward of a period is
+    An action is a joint velocity as a share of the joints' limits, held for a control period; `Spaces` makes the
+    observation. The reward of a period is
 
         r = −‖y* − y‖ T
 
@@ -74,7 +74,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
     Attributes:
         natural_size: of a feature, in its unit.
-        resolved: what all runs have in common.
+        resolved: the settings that all runs share.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - Gymnasium's
@@ -109,11 +109,11 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self._experiment: Experiment | None = experiment
         self._rollout: Rollout | None = None
         self._over = True
-        self._view = View(experiment.plant.spec, self.resolved.run.preview_rows)
-        self.metadata = self.metadata | {"render_fps": 1.0 / self._view.spec.period}
-        self._outside: OutsideView | None = None
-        self.natural_size = self._view.spec.feature.scale
-        self.observation_space, self.action_space = self._view.observations, self._view.actions
+        self._spaces = Spaces(experiment.plant.spec, self.resolved.run.preview_rows)
+        self.metadata = self.metadata | {"render_fps": 1.0 / self._spaces.spec.period}
+        self._outside: OutsideScene | None = None
+        self.natural_size = self._spaces.spec.feature.scale
+        self.observation_space, self.action_space = self._spaces.observations, self._spaces.actions
 
     @property
     def observation(self) -> Observation | None:
@@ -130,7 +130,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             options: there are none.
 
         Returns:
-            What the policy sees; `seed`, `robot` (the drawn values) and, of a run that failed already, `reason`.
+            The observation of the policy; `seed`, `robot` (the drawn values) and, if the run failed already, `reason`.
 
         Raises:
             ConfigurationError: options are given.
@@ -141,20 +141,20 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self.close()
         self._experiment = experiment = build(with_seed(self.resolved, run_seed))
         rows = experiment.periods + 1 + experiment.run.preview_rows  # also those after the last period
-        desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
-        self._action = np.zeros(self._view.spec.n)
+        desired = experiment.scenario.reference.sampled(self._spaces.spec.period, rows)
+        self._action = np.zeros(self._spaces.spec.n)
         self._over = False
         info = {"seed": run_seed, "robot": experiment.drawn.as_record()}
         self._fault: RunFault | None = None
         try:
             observation = experiment.plant.reset(named_seed(run_seed, "plant"))
         except RunFault as fault:
-            spec, start = self._view.spec, experiment.scenario.start
+            spec, start = self._spaces.spec, experiment.scenario.start
             start = np.zeros(spec.n) if start is None else start
             observation, self._fault = Observation(0.0, start, np.zeros(spec.m), feature_valid=False), fault
             info["reason"] = str(fault)
         self._rollout = Rollout(experiment.plant, observation, desired, experiment.loop)
-        return self._see(self._rollout), info
+        return self._observe(self._rollout), info
 
     def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
         """Hold an action for a period.
@@ -163,8 +163,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             action: (n,), share of the joints' speed limits; clipped to it.
 
         Returns:
-            What the policy sees, the reward, whether the run failed, whether the task is over, and `time` [s], `error`
-            (true, in natural sizes) and, of a run that failed, `reason`.
+            The observation of the policy, the reward, whether the run failed, whether the task is over, and `time` [s],
+            `error` (true, in natural sizes) and, of a run that failed, `reason`.
 
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called, or the episode is over.
@@ -173,29 +173,29 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         experiment, rollout, reason = self._experiment, self._rollout, None
         if experiment is None or rollout is None or self._over:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode has begun, or it is over")
-        self._action = self._view.action(action)
+        self._action = self._spaces.action(action)
         try:
             if self._fault is not None:
                 rollout.k += 1
                 raise self._fault
-            rollout.advance(Command(self._view.command(self._action)))
+            rollout.advance(Command(self._spaces.command(self._action)))
             if rollout.lost() is not None:
                 reason = str(rollout.loss())
         except RunFault as fault:
             reason = str(fault)
-        period = self._view.spec.period
-        error = float(self._view.error(experiment.plant.truth(), rollout.reference[0]))
+        period = self._spaces.spec.period
+        error = float(self._spaces.error(experiment.plant.truth(), rollout.reference[0]))
         periods = 1 if reason is None else experiment.periods - rollout.k + 1
         info = {"time": rollout.k * period, "error": error} | ({"reason": reason} if reason else {})
         ended = reason is None and not rollout.running
         self._over = ended or reason is not None
-        return self._see(rollout), -error * periods * period, reason is not None, ended, info
+        return self._observe(rollout), -error * periods * period, reason is not None, ended, info
 
-    def _see(self, rollout: Rollout) -> Floats32:
-        return self._view.see(rollout.observation, rollout.reference, self._action)
+    def _observe(self, rollout: Rollout) -> Floats32:
+        return self._spaces.observe(rollout.observation, rollout.reference, self._action)
 
     def render(self) -> ByteArray | None:
-        """Return the present picture, (h, w, 3): what the plant's camera sees, or the arm from outside.
+        """Return the present picture, (h, w, 3): that of the plant's camera, or the arm from outside.
 
         The camera's picture has the detected ball or discs marked, that from outside the target of the ball.
 
@@ -212,7 +212,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if picture is not None:
             return picture
         if self._outside is None:
-            self._outside = OutsideView(experiment.drawn, self.resolved.request)
+            self._outside = OutsideScene(experiment.drawn, self.resolved.request)
         move = experiment.loop.camera_move
         moved = move is not None and rollout.k > move.period
         return self._outside.picture(rollout.observation.joint_position, rollout.reference[0], moved=moved)
@@ -227,7 +227,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             self._experiment = None
 
 
-class OutsideView:
+class OutsideScene:
     """A scene with the true arm of a run."""
 
     def __init__(self, drawn: Drawn, request: RunRequest) -> None:

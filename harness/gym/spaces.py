@@ -17,8 +17,8 @@ FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors a
 
 
 @final
-class View:
-    """The observation of a policy: what every controller gets, and its own last action, as one vector.
+class Spaces:
+    """The observation of a policy: that of every controller, and its own last action, as one vector.
 
     | part | size | unit |
     |---|---|---|
@@ -34,11 +34,11 @@ class View:
     def __init__(self, spec: PlantSpec, preview: int) -> None:
         """Take the plant's spec and the number of future rows of the reference."""
         self.spec = spec
-        seen = np.full(spec.m, FEATURE_BOUND)
+        feature = np.full(spec.m, FEATURE_BOUND)
         error = np.full((1 + preview) * spec.m, 2 * FEATURE_BOUND)
         ones = np.ones(spec.n)
-        lower = np.concatenate([spec.joint_lower, -seen, -error, np.zeros(spec.m), -ones])
-        upper = np.concatenate([spec.joint_upper, seen, error, np.ones(spec.m), ones])
+        lower = np.concatenate([spec.joint_lower, -feature, -error, np.zeros(spec.m), -ones])
+        upper = np.concatenate([spec.joint_upper, feature, error, np.ones(spec.m), ones])
         self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
         self.observations = Box(self._lower, self._upper, dtype=np.float32)
         self.actions = Box(-1.0, 1.0, (spec.n,), np.float32)
@@ -61,7 +61,7 @@ class View:
             raise ValueError(f"action must be an array of numbers, got {given!r}")
         return as_array("action", numbers, (*lanes, self.spec.n))
 
-    def see(self, observation: Observation, reference: FloatArray, action: npt.ArrayLike) -> Floats32:
+    def observe(self, observation: Observation, reference: FloatArray, action: npt.ArrayLike) -> Floats32:
         """Return the policy's observation.
 
         Args:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
-from servobench.harness.gym.spaces import Floats32, View
+from servobench.harness.gym.spaces import Floats32, Spaces
 from servobench.harness.run.lanes import Together, build_together, side_by_side_key
 from servobench.harness.run.loop import Rollout
 from servobench.plant.contract.checks import FloatArray
@@ -40,7 +40,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
         Args:
             num_envs: number of lanes.
-            choice: what the runs have in common, by the arguments of `ServoEnv`.
+            choice: arguments of `ServoEnv`, which all runs share.
 
         Raises:
             ConfigurationError: a number, name, setting or mismatch that cannot be used, or a plant that carries out
@@ -74,7 +74,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             options: there are none.
 
         Returns:
-            What the policies see, (num_envs, k), and `seed`, (num_envs,).
+            The observations of the policies, (num_envs, k), and `seed`, (num_envs,).
 
         Raises:
             ConfigurationError: options are given, or a seed above 2⁶³ − num_envs.
@@ -87,7 +87,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         seeds = self.np_random.integers(SEEDS, size=count) if seed is None else seed + np.arange(count)
         self.close_extras()
         self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
-        self._view = View(many.bench.spec, many.loop.preview)
+        self._spaces = Spaces(many.bench.spec, many.loop.preview)
         rows = many.loop.periods + 1 + many.loop.preview  # also those after the last period
         period = many.bench.spec.period
         desired = np.stack([each.scenario.reference.sampled(period, rows) for each in many.drawn])
@@ -95,7 +95,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self._action: FloatArray = np.zeros((self.num_envs, many.bench.spec.n))
         observation = many.bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
         self._rollout = Rollout(many.bench, observation, desired, many.loop)
-        return self._see(), {"seed": seeds}
+        return self._observe(), {"seed": seeds}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Hold an action in every lane for a period; see `ServoEnv.step`.
@@ -112,28 +112,28 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             raise gymnasium.error.ResetNeeded("call reset before step")
         if self._ended:
             none = np.zeros(self.num_envs, dtype=np.bool_)
-            seen, info = self.reset()
-            return seen, np.zeros(self.num_envs), none, none.copy(), info
-        self._action = self._view.action(actions, self.num_envs)
+            observed, info = self.reset()
+            return observed, np.zeros(self.num_envs), none, none.copy(), info
+        self._action = self._spaces.action(actions, self.num_envs)
         rollout = self._rollout
-        rollout.advance(Command(self._view.command(self._action)))
+        rollout.advance(Command(self._spaces.command(self._action)))
         lost = rollout.lost()
         failed = np.zeros(self.num_envs, dtype=np.bool_) if lost is None else lost
         failed[list(many.bench.faults)] = True
-        error = self._view.error(many.bench.truth(), rollout.reference[:, 0])
+        error = self._spaces.error(many.bench.truth(), rollout.reference[:, 0])
         self._ended = not rollout.running or bool(failed.any())
-        period = self._view.spec.period
+        period = self._spaces.spec.period
         periods = np.where(failed, many.loop.periods - rollout.k + 1, 1)
         info = {"time": rollout.k * period, "error": error}
-        return self._see(), -error * periods * period, failed, ~failed & self._ended, info
+        return self._observe(), -error * periods * period, failed, ~failed & self._ended, info
 
     @property
     def observation(self) -> Observation:
         """The present observation of the plant, as controllers get it; arrays have a leading axis."""
         return self._rollout.observation
 
-    def _see(self) -> Floats32:
-        return self._view.see(self._rollout.observation, self._rollout.reference, self._action)
+    def _observe(self) -> Floats32:
+        return self._spaces.observe(self._rollout.observation, self._rollout.reference, self._action)
 
     def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
         """Free the plant."""

@@ -1,7 +1,7 @@
-"""Controllers and plants of third parties, held to their contracts: what a method returns is looked at first.
+"""Controllers and plants of third parties, held to their contracts: each answer of a method is checked first.
 
 Without this a step that returns an array ends in an attribute error of the loop, far from the line that is wrong. The
-controllers and plants that this package composes itself are not looked at, so that they cost nothing.
+controllers and plants that this package composes itself are not checked, so that they cost nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
-PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second look
+PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
@@ -32,7 +32,7 @@ def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Contr
 
 @final
 class _HeldController(Controller):
-    """A controller whose answers are looked at."""
+    """A controller whose answers are checked."""
 
     def __init__(self, controller: Controller, spec: PlantSpec) -> None:
         self._controller, self._spec = controller, spec
@@ -82,7 +82,7 @@ class _HeldController(Controller):
 
 @final
 class _HeldPlant(Plant):
-    """A plant whose answers are looked at."""
+    """A plant whose answers are checked."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant, self.spec = plant, plant.spec
@@ -116,19 +116,19 @@ class _HeldPlant(Plant):
         self._plant.close()
 
     def _observation(self, method: Callable[..., Any], signature: str, argument: object) -> Observation:
-        seen, name = _call(method, signature, argument), method.__name__
-        if not isinstance(seen, Observation):
-            text = f"{name} of the plant must return an Observation, got {_kind(seen)}"
+        observation, name = _call(method, signature, argument), method.__name__
+        if not isinstance(observation, Observation):
+            text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
             raise WrongAnswer(f"{text}; write `return Observation(time, joint_position, feature)`", method)
         for what, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
-            shape = getattr(seen, what).shape
+            shape = getattr(observation, what).shape
             if shape != (size,):
                 raise WrongAnswer(f"{name} of the plant: {what} must have shape ({size},), got {shape}", method)
-        return seen
+        return observation
 
 
-def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - what it returns
-    """Call a method; where it does not take these arguments, raise what its signature must be."""
+def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - any answer
+    """Call a method; if it does not take these arguments, the error names the signature that it needs."""
     try:
         return method(*arguments)
     except TypeError as error:
@@ -144,7 +144,7 @@ def _is_number(value: object) -> bool:
 
 
 def _kind(value: object) -> str:
-    """Return what a value is, in a few words."""
+    """Return the kind of a value, in a few words."""
     if isinstance(value, np.ndarray):
         return f"ndarray of shape {value.shape}"
     if isinstance(value, type):

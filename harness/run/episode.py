@@ -36,10 +36,10 @@ def run_experiment(
     """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
     Args:
-        request: what to run.
+        request: the run.
         settings: overrides of the defaults.
         steps: also return one row a period.
-        picture: also return what the camera saw last, where there is one.
+        picture: also return the last picture of the camera, if there is one.
         keep: results folder in which trained networks are kept beside the runs.
 
     Raises:
@@ -72,7 +72,7 @@ def carry_out(
     except BaseException as error:
         if ends_batch(error) or (debug and is_defect(error)):
             raise
-        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row says what
+        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
     finally:
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
@@ -100,7 +100,7 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
 
     Raises:
         Exception: they cannot be built together, because something is wrong with one of them; each has to be carried
-            out by itself, and its row says what it is.
+            out by itself, and its row names the error.
     """
     most = max(1, ROWS_AT_ONCE // runs[0].run.periods(draw(runs[0]).scenario.duration))
     parts = (runs[first : first + most] for first in range(0, len(runs), most))

@@ -138,9 +138,14 @@ def _run(experiment: Experiment) -> ControllerRun:
     inputs, outputs = [], []
     try:
         for period in islice(periods(_begin(experiment), controller), REFERENCE_PERIODS):
-            seen, estimate = period.observation, controller.estimated_jacobian()
-            rows = seen.joint_position, seen.feature, seen.valid.astype(np.float64), period.reference
-            inputs.append([seen.time, *(np.ravel(row) for row in rows)])
+            observation, estimate = period.observation, controller.estimated_jacobian()
+            rows = (
+                observation.joint_position,
+                observation.feature,
+                observation.valid.astype(np.float64),
+                period.reference,
+            )
+            inputs.append([observation.time, *(np.ravel(row) for row in rows)])
             outputs.append([period.command.joint_velocity, unknown if estimate is None else np.ravel(estimate)])
     except RunFault as fault:
         if not outputs:

@@ -28,7 +28,7 @@ _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
 def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
-    """Return what every controller may know."""
+    """Return the knowledge that every controller gets."""
     if not robot.known:
         return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
     return RobotKnowledge(
@@ -48,7 +48,7 @@ def _cameras(nominal: RobotModel) -> CameraModel | None:
 
 
 def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:
-    """Return what networks are trained on: a Jacobian that says nothing about what the cameras do not see."""
+    """Return the knowledge for training networks: its Jacobian covers postures with the target in view only."""
     if nominal is robot.nominal:
         return knowledge
     return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
@@ -93,9 +93,7 @@ def network_source(
         if keep is not None:
             path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"
             if not path.exists():
-                with contextlib.suppress(
-                    OSError
-                ):  # a folder that takes no more files is told of where rows are written
+                with contextlib.suppress(OSError):  # a full folder is reported where rows are written
                     save_networks(networks, path)
         return networks
 

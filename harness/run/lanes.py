@@ -42,7 +42,7 @@ class Ends:
 
     Attributes:
         running: indices of the runs that are under way, ascending.
-        faults: what ended a run, by its index.
+        faults: the error that ended a run, by its index.
         rows: rows of the log that such a run has.
     """
 
@@ -91,7 +91,7 @@ class _Member:
 
 @final
 class ManyBenches(Plant):
-    """A bench of many lanes, as the loop sees it."""
+    """A bench of many lanes, for the loop."""
 
     def __init__(self, bench: Bench, ends: Ends) -> None:
         """Take the bench, which has a lane for each run."""
@@ -100,16 +100,16 @@ class ManyBenches(Plant):
 
     def reset(self, seed: Any) -> Observation:  # noqa: ANN401 - a seed of each run
         """See `Plant.reset`."""
-        self._seen = self._bench.reset(seed)
+        self._last = self._bench.reset(seed)
         self._truth = self._bench.truth()
-        return self._seen
+        return self._last
 
     def step(self, command: Command) -> Observation:
         """See `Plant.step`; a run whose plant fails ends."""
         self._leave()
         if len(self._ends.running) < self._ends.count:
             command = Command(take(command.joint_velocity, self._ends.running))
-        seen = self._bench.step(command)
+        observation = self._bench.step(command)
         faults = self._bench.faults
         if faults:
             lanes = self._ends.running
@@ -118,10 +118,10 @@ class ManyBenches(Plant):
             stay = self._member.left()
             if stay is not None:
                 self._bench.keep(stay)
-                seen = take(seen, stay)
+                observation = take(observation, stay)
         self._k += 1
-        self._seen = self._spread(seen)
-        return self._seen
+        self._last = self._spread(observation)
+        return self._last
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
@@ -147,15 +147,15 @@ class ManyBenches(Plant):
         if stay is not None:
             self._bench.keep(stay)
 
-    def _spread(self, seen: Observation) -> Observation:
+    def _spread(self, observation: Observation) -> Observation:
         names = ("joint_position", "feature", "feature_valid", "valid")
-        arrays = [self._ends.spread(getattr(seen, name), getattr(self._seen, name)) for name in names]
-        return trusted_observation(seen.time, *arrays)
+        arrays = [self._ends.spread(getattr(observation, name), getattr(self._last, name)) for name in names]
+        return trusted_observation(observation.time, *arrays)
 
 
 @final
 class ManyServos(Controller):
-    """A composed controller of many lanes, as the loop sees it."""
+    """A composed controller of many lanes, for the loop."""
 
     def __init__(self, servo: Servo, ends: Ends) -> None:
         """Take the servo, which has a lane for each run where its parts know the true robot."""
@@ -205,10 +205,10 @@ class ManyServos(Controller):
 def failing_lanes(
     servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
 ) -> list[tuple[int, Exception]]:
-    """Return the lanes in which a step fails, and what each raises as a single run, by halving."""
+    """Return the lanes in which a step fails, each with its error as a single run, by halving."""
     try:
         servo.step(take(state, lanes), *take(given, lanes))
-    except Exception as error:  # noqa: BLE001 - whatever a part raises
+    except Exception as error:  # noqa: BLE001 - a part may raise anything
         if len(lanes) == 1:
             return [(int(lanes[0]), _as_single_run(servo, state, given, int(lanes[0]), error))]
         half = len(lanes) // 2
@@ -257,7 +257,7 @@ class Together:
 
 
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
-    """Return what runs of one campaign must share to advance together; None for a run that goes alone."""
+    """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
     request = run.request
     if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
         return None
@@ -270,7 +270,7 @@ def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Tog
     """Make runs of one `side_by_side_key` ready.
 
     Raises:
-        Exception: whatever a run alone would raise, or runs that cannot advance together.
+        Exception: any error of a run alone, or runs that cannot advance together.
     """
     first, drawn = runs[0], tuple(draw(run) for run in runs)
     moved = [each.moved.camera for each in drawn if each.moved is not None]

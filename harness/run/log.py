@@ -31,7 +31,7 @@ class Steps:
     spec: PlantSpec  # names and units for the columns
     time: FloatArray  # (k,) [s]
     reference: FloatArray  # (k, ..., m) [unit of the feature]
-    feature: FloatArray  # (k, ..., m), what the controller saw [unit of the feature]
+    feature: FloatArray  # (k, ..., m), as measured [unit of the feature]
     true_feature: FloatArray  # (k, ..., m) [unit of the feature]
     joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
     command: FloatArray  # (k, ..., n) [rad/s]
@@ -73,7 +73,7 @@ class Steps:
         """Return a table with one row a period.
 
         Args:
-            run_id: what the first column holds.
+            run_id: content of the first column.
             full_jacobian: add every entry of the estimated and of the true Jacobian.
         """
         columns: dict[str, object] = {"run_id": run_id, "step": np.arange(len(self)), "time_s": self.time}

@@ -1,4 +1,4 @@
-"""The loop: the only place that sees plant, controller and reference together; for one run or many side by side.
+"""The loop: the only place that knows plant, controller and reference; for one run or many side by side.
 
 reference(t) ------------.
                          v

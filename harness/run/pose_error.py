@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
-from servobench.harness.run.references import Reference, View
+from servobench.harness.run.references import ImageReference, Reference
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
@@ -19,7 +19,7 @@ def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) ->
 
     Where the camera is moved during the run, the target is still judged by where it was taught.
     """
-    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, View)):
+    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, ImageReference)):
         return None
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
     return 1e3 * distance, np.degrees(angle)

@@ -56,7 +56,7 @@ class FixedPoint(Reference):
     target: FloatArray
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
-        """Return the target, whatever the time."""
+        """Return the target, the same at all times."""
         times = np.asarray(time, dtype=np.float64)
         return np.broadcast_to(self.target, (*times.shape, len(self.target))).copy()
 
@@ -148,7 +148,7 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         raise ValueError(f"waypoint file {path}: {error}") from error
 
 
-class View(Reference):
+class ImageReference(Reference):
     """A desired place of the target over time, and its image."""
 
     model: SetupModel
@@ -165,7 +165,7 @@ class View(Reference):
 
 @final
 @dataclass(frozen=True, eq=False)
-class TaughtView(View):
+class TaughtImage(ImageReference):
     """The target where it is with the arm at given joint positions."""
 
     model: SetupModel
@@ -179,7 +179,7 @@ class TaughtView(View):
 
 @final
 @dataclass(frozen=True, eq=False)
-class FollowedCurve(View):
+class FollowedCurve(ImageReference):
     """The target on a curve in space, as above."""
 
     model: SetupModel
@@ -195,5 +195,5 @@ class FollowedCurve(View):
 
 
 def in_space(curve: Reference, model: object, robot: Robot | None) -> Reference:
-    """Return what the features should be for a ball on a curve: the curve itself where they are places."""
+    """Return the desired features of a ball on a curve: the curve itself where features are places."""
     return FollowedCurve(model, curve, robot) if isinstance(model, SetupModel) and robot is not None else curve

@@ -42,7 +42,7 @@ class WrongAnswer(TypeError):
     """A method of a controller or a plant returned something else than its contract says, or cannot be called by it."""
 
     def __init__(self, text: str, method: Callable[..., Any]) -> None:
-        """Say what is wrong with what a method returned, and which one it is."""
+        """Take the message and the method that gave the wrong answer."""
         super().__init__(text)
         self.method = method
 
@@ -53,7 +53,7 @@ class Ending:
 
     status: str = COMPLETED
     reason: str = ""  # one line with the place; empty for a run that completed
-    trace: str = ""  # lines; empty where there is nothing to look for
+    trace: str = ""  # lines; empty where there is no defect
 
     @classmethod
     def of(cls, error: BaseException) -> Ending:
@@ -99,7 +99,7 @@ def describe_error(error: BaseException) -> str:
 
 
 def is_defect(error: BaseException) -> bool:
-    """Return whether an error is a defect of somebody's code, and no fault that a run may end with."""
+    """Return whether an error is a defect of code, and no fault that a run may end with."""
     return not isinstance(error, RunFault)
 
 
@@ -109,7 +109,7 @@ def ends_batch(error: BaseException) -> bool:
 
 
 def log_entry(row: Mapping[str, Any], trace: str) -> str:
-    """Return what the log of failures says about a run; nothing about one that completed.
+    """Return the entry of a run in the log of failures; empty for one that completed.
 
     Args:
         row: its row in the table of runs.
@@ -139,7 +139,7 @@ def _behind(error: BaseException) -> BaseException:
 
 
 def _place(error: BaseException) -> _Place | None:
-    """Return the line to look at; None for a fault that this package raised."""
+    """Return the place of the defect; None for a fault that this package raised."""
     if isinstance(error, WrongAnswer):
         return _beginning(error.method)
     frames = list(traceback.walk_tb(error.__traceback__))
@@ -181,7 +181,7 @@ def _plugin_packages() -> frozenset[str]:
 
 @cache
 def _libraries() -> tuple[str, ...]:
-    """Return the folders of the standard library and of what is installed."""
+    """Return the folders of the standard library and of installed packages."""
     paths = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     return *paths, *site.getsitepackages(), site.getusersitepackages()
 

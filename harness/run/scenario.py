@@ -13,7 +13,7 @@ from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 
-from servobench.harness.run.references import FixedPoint, Reference, TaskKind, TaughtView, in_space
+from servobench.harness.run.references import FixedPoint, Reference, TaskKind, TaughtImage, in_space
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.signals import Channel
@@ -65,7 +65,7 @@ class TaskSetting:
         """
         model = self.taught_on()[1]
         return (
-            TaughtView(model, joint_position)
+            TaughtImage(model, joint_position)
             if isinstance(model, SetupModel)
             else FixedPoint(model.feature(joint_position))
         )

@@ -1,7 +1,7 @@
-"""A controller beside a logged run: what it would have commanded at each instant, given what was seen there.
+"""A controller beside a logged run: its commands for the observations of each instant.
 
-The loop is open. Joint positions and features are those of the log whatever the controller commands, so nothing here
-says how a run under its commands would have gone; what is compared is its answer to the same observations.
+The loop is open. Joint positions and features are those of the log, independent of the commands, so nothing here
+predicts a run under these commands; only the answers to the same observations are compared.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 COMMAND: Final = "joint_velocity_command"
-LOGGED: Final = "logged_"  # before the name of a column with what was commanded when the log was made
+LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
 
 @final
 class LoggedPlant(Plant):
-    """A logged run as a plant that shows what was seen, row by row, and does not answer to commands.
+    """A logged run as a plant that returns the logged observations, row by row, and ignores commands.
 
-    After the last row it shows that row again.
+    After the last row it returns that row again.
     """
 
     def __init__(self, spec: PlantSpec, table: pd.DataFrame) -> None:
@@ -69,7 +69,7 @@ class LoggedPlant(Plant):
         return self._row()
 
     def step(self, command: Command) -> Observation:
-        """Show the next row, whatever the command. See `Plant.step`."""
+        """Return the next row; the command is ignored. See `Plant.step`."""
         self._k = min(self._k + 1, len(self._time) - 1)
         return self._row()
 
@@ -116,19 +116,19 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         raise ConfigurationError(f"controller {request.controller} fails in row {row} of the log: {fault}") from fault
     finally:
         experiment.plant.close()
-    seen = log.steps().table(request.run_id)
+    steps = log.steps().table(request.run_id)
     names = command_columns(spec)
     if set(names) <= set(table):
-        seen[[LOGGED + name for name in names]] = _columns(table, names)
-    return seen
+        steps[[LOGGED + name for name in names]] = _columns(table, names)
+    return steps
 
 
-def has_commands(seen: pd.DataFrame) -> bool:
+def has_commands(steps: pd.DataFrame) -> bool:
     """Return whether a table of `shadow` has the commands of its log."""
-    return any(str(name).startswith(LOGGED) for name in seen)
+    return any(str(name).startswith(LOGGED) for name in steps)
 
 
-def differences(seen: pd.DataFrame) -> pd.DataFrame:
+def differences(steps: pd.DataFrame) -> pd.DataFrame:
     """Return how far the commands of a table of `shadow` are from those of its log.
 
     Returns:
@@ -137,11 +137,11 @@ def differences(seen: pd.DataFrame) -> pd.DataFrame:
     Raises:
         ConfigurationError: the log had no commands.
     """
-    logged = [name for name in map(str, seen) if name.startswith(LOGGED)]
+    logged = [name for name in map(str, steps) if name.startswith(LOGGED)]
     if not logged:
         raise ConfigurationError(f"the log has no commands to compare with, columns {COMMAND}_…")
     names = [name.removeprefix(LOGGED) for name in logged]
-    was, apart = seen[logged].to_numpy(), seen[names].to_numpy() - seen[logged].to_numpy()
+    was, apart = steps[logged].to_numpy(), steps[names].to_numpy() - steps[logged].to_numpy()
     rms = (np.sqrt(np.mean(each**2, axis=0)) for each in (was, apart))
     joints = [name.removeprefix(f"{COMMAND}_") for name in names]
     columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
@@ -154,7 +154,7 @@ def feature_columns(spec: PlantSpec, kind: str) -> list[str]:
 
 
 def joint_columns(spec: PlantSpec, kind: str, unit: str) -> list[str]:
-    """Return the names of the columns with what a kind has for each joint."""
+    """Return the names of the columns of a kind, one for each joint."""
     return [column_name(kind, name, unit) for name in spec.joint_names]
 
 

@@ -43,11 +43,11 @@ DRAWN_AT_ONCE: Final = 256
 MAX_DRAWS: Final = 25_600
 PLANNED_SHARE: Final = 0.8  # of the images' half sides in which the planned cameras see the features
 TRUE_SHARE: Final = 0.95  # the same of the true ones
-FACING: Final = 0.7  # cosine of the angle at which the target's front is seen: 45°
+FACING: Final = 0.7  # cosine of the angle between the target's front and the camera: 45°
 REACHED: Final = 1e-6  # of the error that `reach_pose` returns
 SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # of D that are tried
 STEPS: Final = 8  # in which the arm is led from home to the start
-IN_VIEW: Final = 0.9  # of the image's half sides in which the target is seen at the start
+IN_VIEW: Final = 0.9  # of the image's half sides in which the target is at the start
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
 feature. A target given as joint positions is therefore observed on the true robot, and is always in reach. Curves are
-given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch; where cameras
+given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there under any mismatch; where cameras
 see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.references`).
 
 A user brings a task as a file with a dataclass below `Task`, or publishes it, or a `TaskEntry`, under the entry-point

@@ -80,7 +80,7 @@ def test_everything_registered_has_a_row_and_nothing_else_has():
     assert first_column("methods.md", "controller") == set(registry.CONTROLLERS)
     assert first_column("plants.md", "plant") == {*registry.PLANTS, "fmu:PATH.toml"}
     assert first_column("plants.md", "task") == set(TASKS)
-    assert set(LAWS) | set(ESTIMATORS) <= set(names(read("methods_parts.md")))
+    assert set(LAWS) | set(ESTIMATORS) <= set(names(read("methods_reference.md")))
 
 
 @pytest.fixture
@@ -188,7 +188,7 @@ def test_the_table_of_equations_has_each_once_and_the_code_names_it_too():
             found += range(int(first), int(last or first) + 1)
         return found
 
-    rows = next(rows for _, header, rows in tables(read("methods_paper.md")) if header[0] == "equation")
+    rows = next(rows for _, header, rows in tables(read("methods_reference.md")) if header[0] == "equation")
     assert sorted(number for row in rows for number in numbers(row[0])) == list(range(1, 47))
     for equations, _, where in rows:
         for path, _ in PLACE.findall(where):

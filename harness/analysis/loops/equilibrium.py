@@ -129,7 +129,7 @@ class SmallLoop:
     """A composed controller, frozen at its rest, on the kinematic plant without noise."""
 
     def __init__(self, warm: Warm, model: HandEyeModel, config: KinematicConfig) -> None:
-        """Freeze the controller, whose estimator tells the true Jacobian wherever the arm is.
+        """Freeze the controller, whose estimator returns the true Jacobian at every posture.
 
         Args:
             warm: the composed controller after its warm-up.
@@ -202,6 +202,6 @@ class _FrozenController(Controller):
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
-        seen = self._rest.observation(observation.feature, observation.joint_position, observation.time)
-        self._state, u = self._servo.step(self._state, seen, reference)
+        measured = self._rest.observation(observation.feature, observation.joint_position, observation.time)
+        self._state, u = self._servo.step(self._state, measured, reference)
         return Command(self._factor * u)

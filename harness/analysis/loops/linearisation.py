@@ -43,7 +43,7 @@ class FrozenEstimation:
     def __init__(self, estimation: Estimation, jacobian: JacobianFunction) -> None:
         """Take the stages, of which the pair stage goes on to remember joint positions, and the Jacobian."""
         self.pairing, self._jacobian = estimation.pairing, jacobian
-        self.into_model_frame = estimation.into_model_frame  # of what was learned before
+        self.into_model_frame = estimation.into_model_frame  # of the Jacobian that was learned before
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; see `Estimation.update`."""
@@ -90,7 +90,7 @@ class Rest:
     preview: int
 
     def observation(self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0) -> Observation:
-        """Return what is seen with other values, (..., m) and (..., n), `after` [s] later."""
+        """Return the observation of other values, (..., m) and (..., n), `after` [s] later."""
         lead = feature.shape[:-1]
         valid: Any = np.full(lead, True)[()] if lead else np.True_
         return trusted_observation(
@@ -117,8 +117,8 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
     m, n = len(rest.feature), len(rest.joint_position)
 
     def stepped(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-        seen = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
-        new, u = servo.step(packing.unpack(x), seen, rest.reference(rest.feature + w[:, m + n :]))
+        measured = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
+        new, u = servo.step(packing.unpack(x), measured, rest.reference(rest.feature + w[:, m + n :]))
         return packing.pack(new, len(x)), u
 
     def differences(dx: FloatArray, dw: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -53,7 +53,7 @@ class LoopAnalysis:
         margins: of the loop.
         response: the frequency response of controller and loop.
         step: each feature after a unit step of its own reference, (periods, m).
-        system: the closed loop from the references to what the controller measures; None for an identified one.
+        system: the closed loop from the references to the measured signals; None for an identified one.
     """
 
     name: str

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -38,9 +38,11 @@ from scipy.optimize import linear_sum_assignment
 from servobench.controllers.controller import Controller
 from servobench.harness.analysis.loops.linearisation import Rest
 from servobench.harness.analysis.loops.systems import ArmModel, ComplexArray, StateSpace
+from servobench.harness.run.loop import LoopSettings, Rollout, periods
+from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged
-from servobench.plant.contract.signals import Observation
+from servobench.plant.contract.signals import Command, Observation, Truth
 
 LENGTH = 256  # [periods] of the multisine
 AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine
@@ -63,6 +65,61 @@ class Record(NamedTuple):
     command: FloatArray
 
 
+@final
+class LinearArm(Plant):
+    """The linear arm around a rest, as a plant whose measurements can be excited.
+
+    Attributes:
+        measured: deviations of features and joint positions since `excite`, one (m + n,) a period.
+    """
+
+    def __init__(self, arm: ArmModel, rest: Rest) -> None:
+        """Begin at the rest."""
+        self._system, self._period, self._rest = arm.matrices(), arm.period, rest
+        self._m = len(arm.jacobian)
+        self._x, self._k = np.zeros(len(self._system.A)), 0
+
+    def excite(self, added: FloatArray) -> Observation:
+        """Add signals to the measurements from now on, (periods, m + n) m and rad, and return the present observation.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        self._added, self.measured = added, list[FloatArray]()
+        return self._observe()
+
+    def reset(self, seed: int) -> Observation:
+        """Measure without excitation; nothing is random. See `Plant.reset`."""
+        return self.excite(np.zeros((0, len(self._system.C))))
+
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        self._x = self._system.A @ self._x + self._system.B @ command.joint_velocity
+        self._k += 1
+        return self._observe()
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        return Truth(self._rest.feature + (self._system.C @ self._x)[: self._m], None)
+
+    def close(self) -> None:
+        """See `Plant.close`; nothing is held."""
+
+    def _observe(self) -> Observation:
+        deviation, row, rest, m = self._system.C @ self._x, len(self.measured), self._rest, self._m
+        if row < len(self._added):
+            deviation = deviation + self._added[row]
+            if not np.abs(deviation[:m]).max() < LARGEST_MOTION:
+                raise ControllerDiverged(f"the loop is unstable: {LARGEST_MOTION} m were exceeded in small motions")
+            self.measured.append(deviation)
+        time = rest.time + self._k * self._period
+        return Observation(time, rest.joint_position + deviation[m:], rest.feature + deviation[:m])
+
+
 class SmallMotions:
     """A controller in closed loop with the linear arm around a rest."""
 
@@ -72,12 +129,8 @@ class SmallMotions:
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        self._controller, self._rest, self._period = controller, rest, arm.period
-        self._plant = arm.matrices()
-        self._m = len(arm.jacobian)
-        self._x, self._k = np.zeros(len(self._plant.A)), 0
-        self._reference = rest.reference(rest.feature)
-        self.run(np.zeros((SETTLING, len(self._plant.C))))
+        self._controller, self._rest, self._arm = controller, rest, LinearArm(arm, rest)
+        self.run(np.zeros((SETTLING, sum(arm.jacobian.shape))))
 
     def run(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
         """Go on with signals added to the measurements, (periods, m + n).
@@ -89,30 +142,19 @@ class SmallMotions:
         Raises:
             ControllerDiverged: the loop is not stable.
         """
-        reference = self._reference if desired is None else self._reference + desired
-        measured, command = np.zeros(added.shape), np.zeros((len(added), self._plant.B.shape[1]))
-        for k, offset in enumerate(added):
-            measured[k] = self._plant.C @ self._x + offset
-            if not np.abs(measured[k, : self._m]).max() < LARGEST_MOTION:
-                raise ControllerDiverged(f"the loop is unstable: {LARGEST_MOTION} m were exceeded in small motions")
-            command[k] = self._controller.step(self._observation(measured[k]), reference).joint_velocity
-            self._x = self._plant.A @ self._x + self._plant.B @ command[k]
-            self._k += 1
-        return Record(measured, command)
+        wanted = self._rest.feature if desired is None else self._rest.feature + desired
+        rows = np.tile(wanted, (len(added) + self._rest.preview + 1, 1))
+        rollout = Rollout(self._arm, self._arm.excite(added), rows, LoopSettings(len(added), self._rest.preview))
+        command = [period.command.joint_velocity for period in periods(rollout, self._controller)]
+        return Record(np.array(self._arm.measured), np.array(command))
 
     def tried(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
-        """Return what `run` does, and go on as if it had not been."""
-        saved, x, k = self._controller.save(), self._x, self._k
+        """Return the record of `run`, and restore the state from before it."""
+        controller, arm = self._controller.save(), self._arm.save()
         record = self.run(added, desired)
-        self._controller.restore(saved)
-        self._x, self._k = x, k
+        self._controller.restore(controller)
+        self._arm.restore(arm)
         return record
-
-    def _observation(self, deviation: FloatArray) -> Observation:
-        rest, m = self._rest, self._m
-        return Observation(
-            rest.time + self._k * self._period, rest.joint_position + deviation[m:], rest.feature + deviation[:m]
-        )
 
 
 def multisine(length: int, amplitude: float) -> FloatArray:

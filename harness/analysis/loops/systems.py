@@ -54,25 +54,25 @@ def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) ->
     """Return the loop of a strictly proper plant with a controller whose command is multiplied by `gain`.
 
     Args:
-        plant: from the command u to what the controller measures, D = 0.
+        plant: from the command u to the measured signals, D = 0.
         controller: from measurements and then references to u.
         gain: factor on u between controller and plant.
 
     Returns:
-        From the references to what the controller measures; the states are those of the plant, then the controller's.
+        From the references to the measured signals; the states are those of the plant, then the controller's.
     """
-    seen = len(plant.C)
+    measured = len(plant.C)
     B, D = controller.B, controller.D
-    by_plant, by_law = D[:, :seen] @ plant.C, controller.C
+    by_plant, by_law = D[:, :measured] @ plant.C, controller.C
     A = np.block(
         [
             [plant.A + gain * plant.B @ by_plant, gain * plant.B @ by_law],
-            [B[:, :seen] @ plant.C, controller.A],
+            [B[:, :measured] @ plant.C, controller.A],
         ]
     )
-    references = np.vstack([gain * plant.B @ D[:, seen:], B[:, seen:]])
-    C = np.hstack([plant.C, np.zeros((seen, len(controller.A)))])
-    return StateSpace(A, references, C, np.zeros((seen, references.shape[1])))
+    references = np.vstack([gain * plant.B @ D[:, measured:], B[:, measured:]])
+    C = np.hstack([plant.C, np.zeros((measured, len(controller.A)))])
+    return StateSpace(A, references, C, np.zeros((measured, references.shape[1])))
 
 
 def decay(A: FloatArray) -> float:
@@ -109,14 +109,14 @@ class ArmModel:
         late, _ = split(self.latency, self.period)
         size, every = len(joint.A), np.eye(n)
         A, B = np.kron(joint.A, every), np.kron(joint.B, every)
-        seen, positions = np.kron(joint.C[:1], self.jacobian), np.kron(joint.C[1:], every)
+        exposed, positions = np.kron(joint.C[:1], self.jacobian), np.kron(joint.C[1:], every)
         line = np.eye(late * m, k=-m)  # frames under way, the newest first
         entry = np.zeros((late * m, size * n))
-        entry[:m] = seen[: late * m]
+        entry[:m] = exposed[: late * m]
         A = np.block([[A, np.zeros((size * n, late * m))], [entry, line]])
         B = np.vstack([B, np.zeros((late * m, n))])
         oldest = np.hstack([np.zeros((m, size * n + late * m - m)), np.eye(m)])
-        feature = oldest if late else seen
+        feature = oldest if late else exposed
         C = np.vstack([feature, np.hstack([positions, np.zeros((n, late * m))])])
         return StateSpace(np.asarray(A, np.float64), np.asarray(B, np.float64), C, np.zeros((m + n, n)))
 
