@@ -23,7 +23,7 @@ from night.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
-from servobench.fmus.compile import parse_platforms
+from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import parse_seeds, parse_variation, refuse_tuning_seeds

@@ -12,7 +12,7 @@ from servobench.controllers.estimators.rbf import RbfConfig, RbfLyapunovConfig
 from servobench.controllers.estimators.rls import RlsConfig
 from servobench.controllers.estimators.robust_filter import RobustConfig
 from servobench.controllers.estimators.ukf import UkfConfig
-from servobench.controllers.initial import InitialConfig
+from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.laws.mfac import MfacConfig
 from servobench.controllers.laws.mpc.mpc import MpcConfig
 from servobench.controllers.laws.pid import PidConfig
