@@ -145,7 +145,7 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
     arm, view = _arm(part), layout.view
     if view is None:
-        ball = HandEyeGeometry(*arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
+        ball = HandEyeGeometry(arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
         feature, jacobian = feature_and_jacobian(q, ball)
         return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
     geometry = _view(part, arm, view)

@@ -20,7 +20,7 @@ import numpy as np
 from servobench.plant.cameras.model import Mount, SetupModel
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import JointLimits, narrowed, rpy_from_rotation
+from servobench.plant.robot.arm import JointLimits, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
@@ -272,7 +272,7 @@ class Actuation:
 
     def stops(self, n: int) -> JointLimits:
         """Return speeds and stops of `n` joints."""
-        return narrowed(self.limits, n, self.max_speed, self.joint_range)
+        return narrow_limits(self.limits, n, self.max_speed, self.joint_range)
 
 
 def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArray]:

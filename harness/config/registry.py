@@ -140,10 +140,10 @@ def find_plant(name: str) -> PlantEntry:
         ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
     """
     if name.startswith(MAPPED):
-        from servobench.plant.fmu.world import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
+        from servobench.plant.fmu.world import fmu_entry  # noqa: PLC0415 - loads CasADi
 
         try:
-            return mapped_entry(user_path(name.removeprefix(MAPPED)))
+            return fmu_entry(user_path(name.removeprefix(MAPPED)))
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
     own = _OFFERED.get(name)

@@ -119,12 +119,12 @@ def family_of(config: SensingConfig) -> Draw:
     return families[config.noise]
 
 
-def quantised(feature: FloatArray, quantum: float) -> FloatArray:
+def quantise(feature: FloatArray, quantum: float) -> FloatArray:
     """Return a feature rounded to the nearest multiple of a quantum, both in its unit; half goes to the even one."""
     return np.asarray(np.rint(feature / quantum) * quantum)
 
 
-def directions(generator: np.random.Generator, shape: Shape) -> FloatArray:
+def draw_directions(generator: np.random.Generator, shape: Shape) -> FloatArray:
     """Return unit vectors, (..., m), of directions that are uniform on the sphere."""
     x = generator.standard_normal(shape)
     return np.asarray(x / np.sqrt(np.vecdot(x, x))[..., None])

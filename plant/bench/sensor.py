@@ -24,7 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.noise import directions, family_of, quantised
+from servobench.plant.bench.noise import draw_directions, family_of, quantise
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
@@ -60,7 +60,7 @@ class Sensor:
         self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
         self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
         self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
-        self._outlier_values = stream("outlier_values", directions, (m,), config.outlier_size)
+        self._outlier_values = stream("outlier_values", draw_directions, (m,), config.outlier_size)
         frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
         self._frames = frames[0], frames[1]
         self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
@@ -76,7 +76,7 @@ class Sensor:
             begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)
             self._outlier = self._outlier.next(begins, frames, self._outlier_values.next())
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
-        return quantised(feature, config.quantum) if config.quantum > 0.0 else feature
+        return quantise(feature, config.quantum) if config.quantum > 0.0 else feature
 
     def missing(self, time: float) -> BoolArray | None:
         """Return in which lanes the frame exposed at `time` [s] arrives without the feature, (...); None for none."""

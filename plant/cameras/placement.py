@@ -65,7 +65,7 @@ class CameraDraws:
         return {f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)}
 
 
-def planned(count: int) -> CameraDraws:
+def planned_draws(count: int) -> CameraDraws:
     """Return the draws of `count` cameras that are as planned."""
     zero = np.zeros(count)
     return CameraDraws(np.ones(count), np.zeros((count, 2)), zero, np.zeros((count, 3)), np.zeros((count, 3)))
@@ -108,7 +108,7 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.n < setup.least_joints:
         wanted = f"an arm of {setup.least_joints} joints or more"
         raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
-    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned(setup.cameras))
+    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned_draws(setup.cameras))
 
 
 def true_model(

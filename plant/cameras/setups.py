@@ -126,7 +126,7 @@ def pixel_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Floa
     return rates.reshape(*rates.shape[:-4], -1, rates.shape[-1])
 
 
-def located(features: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
+def locate_points(features: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
     """Return the points that have given `pixels`, (..., c, p, 3) m."""
     return locate(features.reshape(*features.shape[:-1], *depth.shape[-2:], 2), depth, optics)
 
@@ -148,7 +148,7 @@ in_pixels = partial(
     unit="px",
     measure=pixels,
     rates=pixel_rates,
-    locate=located,
+    locate=locate_points,
     scale=pixels_per_metre,
     single=True,
 )

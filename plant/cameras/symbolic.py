@@ -51,39 +51,26 @@ class ArmGeometry(NamedTuple):
         return cls(*map(casadi.SX, (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio)))
 
 
-@dataclass(frozen=True, eq=False)
-class HandEyeGeometry:
-    """Everything that describes arm and camera, as CasADi symbols or constants.
+class HandEyeGeometry(NamedTuple):
+    """Everything that describes an arm under a fixed camera, as CasADi symbols or constants.
 
     Attributes:
-        translation: (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`.
-        rpy: (n+1, 3), rad.
-        joint_offset: o, (n,), rad.
-        gear_ratio: g, (n,).
-        tool: t, (3,), m.
+        arm: the arm.
+        tool: t, (3,), m, ball centre in the flange frame.
         R_BC: (3, 3), camera in the base frame.
         p_BC: (3,), m, camera in the base frame.
     """
 
-    translation: SX
-    rpy: SX
-    joint_offset: SX
-    gear_ratio: SX
+    arm: ArmGeometry
     tool: SX
     R_BC: SX
     p_BC: SX
 
-    @property
-    def arm(self) -> ArmGeometry:
-        """The part that describes the arm."""
-        return ArmGeometry(self.translation, self.rpy, self.joint_offset, self.gear_ratio)
-
-
-def geometry_of(model: HandEyeModel) -> HandEyeGeometry:
-    """Return the geometry of `model` as constants."""
-    arm = model.arm
-    numbers = (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio, arm.tool)
-    return HandEyeGeometry(*(casadi.SX(number) for number in (*numbers, model.X_BC[:3, :3], model.X_BC[:3, 3])))
+    @classmethod
+    def of(cls, model: HandEyeModel) -> Self:
+        """Return the geometry of `model` as constants."""
+        numbers = model.arm.tool, model.X_BC[:3, :3], model.X_BC[:3, 3]
+        return cls(ArmGeometry.of(model.arm), *map(casadi.SX, numbers))
 
 
 def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple[SX, SX]:
@@ -99,7 +86,7 @@ def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple
     axes, origins, rotation, position = arm_frames(joint_position, geometry.arm)
     ball = position + rotation @ geometry.tool
     columns = [
-        geometry.gear_ratio[i] * casadi.cross(axis, ball - origin)
+        geometry.arm.gear_ratio[i] * casadi.cross(axis, ball - origin)
         for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
     ]
     return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
@@ -127,7 +114,7 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
 def symbolic_ball(model: HandEyeModel) -> casadi.Function:
     """Return q -> feature, (n,) rad -> (3,) m, with the numbers of `model` bound."""
     q = casadi.SX.sym("joint_position", model.arm.n)
-    feature = feature_and_jacobian(q, geometry_of(model))[0]
+    feature = feature_and_jacobian(q, HandEyeGeometry.of(model))[0]
     return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 

@@ -301,11 +301,6 @@ class Instance(ABC):
 
         return checked
 
-    def derivative(self, unknowns: Port, knowns: Port) -> None:
-        """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
-        buffers = (*self._row(knowns, 0), *self._row(unknowns, 0))
-        self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
-
     def save(self) -> ctypes.c_void_p:
         """Return the present state; it has to be given to `free`."""
         state = ctypes.c_void_p()

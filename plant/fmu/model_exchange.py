@@ -73,7 +73,7 @@ class FmuModel:
         return np.array(rows, dtype=np.float64).reshape(*q.shape[:-1], *rows[0].shape)
 
 
-def mapped_model(
+def build_model(
     mapping: FmuMapping, description: FmuDescription, parameters: Mapping[str, FloatArray] | None = None
 ) -> FmuModel:
     """Return the model of a mapped FMU.

@@ -31,7 +31,7 @@ from servobench.plant.fmu.instance import FmuState, Instance, Port
 from servobench.plant.fmu.instances import Instances, Lane
 from servobench.plant.fmu.library import InstanceOptions, logger
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
-from servobench.plant.fmu.model_exchange import mapped_model
+from servobench.plant.fmu.model_exchange import build_model
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -135,9 +135,9 @@ class FmuWorld(World):
         sizes_first = sorted(setters.values(), key=lambda pair: pair[0].causality != STRUCTURAL)
         self._setters = [act for _, act in sizes_first]
         self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
-        self._true = mapped_model(mapping, self.description) if truth.states else None
+        self._true = build_model(mapping, self.description) if truth.states else None
         nominal = mapping.nominal
-        self._nominal = None if nominal is None else mapped_model(mapping, self.description, nominal)
+        self._nominal = None if nominal is None else build_model(mapping, self.description, nominal)
 
     def _lane(self, instance: Instance, row: int) -> Lane:
         return Lane(
@@ -270,7 +270,7 @@ class FmuWorld(World):
             ValueError: it has no such side, or the joints and features are not states and outputs of it.
         """
         if self._true is None:
-            self._true = mapped_model(self._mapping, self.description)
+            self._true = build_model(self._mapping, self.description)
         return TrueModel(self._true.jacobian, self._true.symbolic)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
@@ -414,7 +414,7 @@ def build_fmu(
         raise ValueError(str(error)) from error
 
 
-def mapped_entry(path: Path) -> PlantEntry:
+def fmu_entry(path: Path) -> PlantEntry:
     """Return the registry's entry of the plant `fmu:PATH`, the FMU that the mapping at `path` describes.
 
     Raises:

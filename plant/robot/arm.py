@@ -277,7 +277,7 @@ class JointLimits:
             raise ValueError(f"joint_velocity_limit must be positive, got {self.speed.tolist()}")
 
 
-def narrowed(limits: JointLimits | None, n: int, speed: float, reach: float) -> JointLimits:
+def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float) -> JointLimits:
     """Return limits of `n` joints within a speed [rad/s], a distance from zero [rad] and, where given, others.
 
     Raises:

@@ -150,7 +150,7 @@ def _robot_of(table: DhTable, path: Path) -> Robot:
     links = estimate_links(arm, _given("mass", table.mass, n), _given("torque", table.torque, n))
     workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     name = table.name or path.stem
-    return Robot(name, name, path.name, arm, limits, links, workspace, note=estimated(table.mass, name))
+    return Robot(name, name, path.name, arm, limits, links, workspace, note=_estimate_note(table.mass, name))
 
 
 def _arm_of(table: DhTable) -> SerialArm:
@@ -169,7 +169,7 @@ def _given(name: str, values: tuple[float, ...], n: int) -> FloatArray | None:
     return as_vector(name, values, n) if values else None
 
 
-def estimated(mass: tuple[float, ...], name: str) -> str:
+def _estimate_note(mass: tuple[float, ...], name: str) -> str:
     """Return the line that names the estimated values."""
     return "" if mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
 

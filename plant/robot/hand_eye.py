@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
-from servobench.plant.robot.arm import JointLimits, SerialArm, narrowed
+from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 
 FEATURE_NAMES = ("x", "y", "z")
 FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
@@ -225,6 +225,6 @@ def hand_eye_spec(
     Raises:
         ValueError: a period, speed or range that is not positive.
     """
-    both = narrowed(limits, model.arm.n, max_joint_speed, joint_range)
+    both = narrow_limits(limits, model.arm.n, max_joint_speed, joint_range)
     spec = PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)
     return replace(spec, feature=model.channel)

@@ -206,7 +206,7 @@ class Clearance:
         return np.asarray((self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1))
 
 
-def watched_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
+def collision_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
     """Return the pairs of tubes, (p, 2), that can collide: not of neighbours, and separate in most of (k, n) rad."""
     link = clearance.tubes.link
     i, j = np.triu_indices(len(link), 1)
@@ -307,7 +307,7 @@ def _at_height(
     clear = Clearance(arm, link_tubes(arm, *shapes), lower, upper, pose, scale, BALL_RADIUS * scale)
     rng = np.random.default_rng(0)
     postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
-    clear = replace(clear, pairs=watched_pairs(clear, postures))
+    clear = replace(clear, pairs=collision_pairs(clear, postures))
     lift = np.array([0.0, 0.0, height])
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
     if home is None:

@@ -24,7 +24,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.fmu.world import FmuConfig, FmuWorld, mapped_entry
+from servobench.plant.fmu.world import FmuConfig, FmuWorld, fmu_entry
 from servobench.plant.robot.ur5 import HOME
 
 QUIET = FmuConfig(0.0, SensingConfig(0.0))
@@ -84,7 +84,7 @@ def place_of(q, arm=(0.5, 0.4)):
 def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, version):
     build_crane(tmp_path / "crane.fmu", version)
     (tmp_path / "crane.toml").write_text(TOML + ROLES[version])
-    entry = mapped_entry(tmp_path / "crane.toml")
+    entry = fmu_entry(tmp_path / "crane.toml")
     plant = entry.build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
     assert plant.spec.joint_names == ("slew", "luff")
     assert plant.spec.feature_names == ("x", "y")

@@ -57,7 +57,9 @@ class Opened:
         columns = []
         for k in range(knowns.values.size):
             knowns.values[:] = np.eye(knowns.values.size)[k]
-            self.instance.derivative(unknowns, knowns)
+            buffers = (*self.instance._row(knowns, 0), *self.instance._row(unknowns, 0))
+            places = *unknowns.variables, *knowns.variables, *buffers
+            self.instance.call("GetDirectionalDerivative", *places)
             columns.append(unknowns.values.copy())
         return np.column_stack(columns)
 

@@ -22,7 +22,7 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.model_exchange import FmuModel
-from servobench.plant.fmu.world import mapped_entry
+from servobench.plant.fmu.world import fmu_entry
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
@@ -56,7 +56,7 @@ def mapped(tmp_path: Path, text: str = MAPPING, description: str | None = None) 
 
 
 def crane(path: Path):
-    entry = mapped_entry(path)
+    entry = fmu_entry(path)
     return entry.build(entry.config(), PlantSetup(None, None, 0.05))
 
 

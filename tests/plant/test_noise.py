@@ -84,7 +84,7 @@ def test_white_and_uniform_noise_have_deviation_1():
 
 def test_quantised_features_are_multiples_that_are_nearest():
     feature = np.random.default_rng(0).normal(size=100)
-    found = families.quantised(feature, 0.05)
+    found = families.quantise(feature, 0.05)
     np.testing.assert_allclose(found / 0.05, np.rint(found / 0.05), atol=1e-12)
     assert np.abs(found - feature).max() <= 0.025 + 1e-15
 

@@ -11,7 +11,7 @@ import pytest
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_urdf
-from servobench.plant.robot.arm import JointLimits, narrowed, rotation_from_rpy
+from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
 from servobench.plant.robot.catalogue import ROBOTS, find_robot, random_robot
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, nearest_title, read_calibration
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -107,7 +107,7 @@ def test_the_distance_of_segments_is_that_of_the_nearest_of_many_points():
 
 
 def test_a_maker_s_limits_hold_beside_those_that_are_set():
-    limits = narrowed(find_robot("panda").limits, 7, 1.0, 2.0)
+    limits = narrow_limits(find_robot("panda").limits, 7, 1.0, 2.0)
     assert (limits.speed == 1.0).all()
     np.testing.assert_array_equal(limits.upper, [2.0, 1.7628, 2.0, -0.0698, 2.0, 2.0, 2.0])
     with pytest.raises(ValueError, match="joint_lower must be below joint_upper"):

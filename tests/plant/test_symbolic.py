@@ -4,7 +4,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit.plants import factory_ur5, nominal_ur5
-from servobench.plant.cameras.symbolic import feature_and_jacobian, geometry_of, symbolic_feature
+from servobench.plant.cameras.symbolic import HandEyeGeometry, feature_and_jacobian, symbolic_feature
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 
@@ -34,7 +34,7 @@ def models():
 @pytest.mark.parametrize("model", models())
 def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     q = casadi.SX.sym("q", model.arm.n)
-    feature, jacobian = feature_and_jacobian(q, geometry_of(model))
+    feature, jacobian = feature_and_jacobian(q, HandEyeGeometry.of(model))
     automatic = casadi.jacobian(symbolic_feature(model)(q), q)
     function = casadi.Function("all", [q], [feature, jacobian, automatic])
     for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, model.arm.n)):
