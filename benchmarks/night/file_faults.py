@@ -37,11 +37,11 @@ from kit.toy import plant_spec
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
-from servobench.harness.batch.checksums import UnwritableFolder
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.tables import UnwritableFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache
 from servobench.harness.run.knowledge import NETWORKS, network_source

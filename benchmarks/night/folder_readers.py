@@ -18,17 +18,17 @@ import pandas as pd
 from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch import results
-from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 from servobench.harness.studies.tuning.scoring import Ledger
 from servobench.plant.contract import cache as entries
+from servobench.plant.contract.checksums import SUMS
 
 SCORES = {"objective": 3, "robots": 2}
 LEDGER = json.dumps(SCORES) + '\n{"settings": {"law": {"gain": 1.5}}, "costs": [0.5, 2]}\n'
-SEAL = '{"a/b.txt": "2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae"}'  # of the text foo
+ENTRY_SUMS = "2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae  files/a/b.txt\n"  # of the text foo
 HOLDER = '{"owner": "ann", "host": "bench", "pid": 4, "begun": "2026-11-22T01:00:00+00:00", "started": "17"}'
 MANIFEST = {
     "run_count": 2, "campaign": "c", "created": "2026-11-22T01:00:00+00:00", "python": "3.11.7", "seeds": "0:2",
@@ -87,9 +87,9 @@ def journal(text: str, folder: Path) -> None:
     assert (again.best(), len(again)) == (ledger.best(), len(ledger))
 
 
-def seal(text: str, folder: Path) -> None:
-    """Look at an entry of the cache; whatever its seal says, it is whole or made anew."""
-    files_of_entry = {f"{entries.FILES}/a/b.txt": b"foo", entries.SEAL: _bytes(text)}
+def cache_entry(text: str, folder: Path) -> None:
+    """Check an entry of the cache with any checksums: it is whole or made anew."""
+    files_of_entry = {f"{entries.FILES}/a/b.txt": b"foo", SUMS: _bytes(text)}
     assert entries.is_whole(_write(folder / "entry", files_of_entry)) in (True, False)
 
 

@@ -56,7 +56,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
     ),
     "folders": (
-        ("harness/batch/tables.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
+        ("harness/batch/tables.py", "plant/contract/checksums.py", "harness/batch/integrity.py",
          "harness/batch/results.py"),
         ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),

@@ -19,7 +19,18 @@ import numpy as np
 from kit.foreign_fmu import describe, describe_exchange, packed
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from kit.toy import plant_spec
-from night.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_runs, other_table, part_name, seal
+from night.folder_readers import (
+    ENTRY_SUMS,
+    HOLDER,
+    LEDGER,
+    cache_entry,
+    files,
+    journal,
+    lock,
+    of_runs,
+    other_table,
+    part_name,
+)
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
@@ -280,7 +291,7 @@ RESULTS: dict[str, Parser] = {
     "other table": Parser(other_table, ("a,b\n1,2\n",), (",", "\n", '"', "\0", *NUMBERS), 0.3),
     "lock": Parser(lock, (HOLDER,), (*JSON_WORDS, *NUMBERS), 1),
     "journal": Parser(journal, (LEDGER,), (*JSON_WORDS, *NUMBERS), 1),
-    "seal": Parser(seal, (SEAL,), (*JSON_WORDS, *NUMBERS, "../"), 1),
+    "cache entry": Parser(cache_entry, (ENTRY_SUMS,), ("  ", "\n", "files/", "../"), 1),
 }
 """What stands in a results folder, a study and the cache."""
 

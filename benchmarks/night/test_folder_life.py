@@ -22,12 +22,12 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from kit.command import judged
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
-from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.plant.contract.checksums import SUMS
 
 RUNS = 4
 BATCH = Batch(("kinematic",), ("constant",), ("random",), ("moderate",), range(RUNS))

@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import Batch, Cell, Grid
-from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
@@ -36,7 +36,7 @@ Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
 
 
 class Results(NamedTuple):
-    """What a results folder holds."""
+    """The content of a results folder."""
 
     runs: pd.DataFrame
     """a row a run"""
@@ -124,7 +124,7 @@ def compare(
         run_timeout: [s] time limit of a run; None for the usual one, if any.
         run_memory: [bytes] memory limit of a run, likewise.
         isolate: carry out code that is not servobench's in processes of its own, with limits, also with one worker.
-        resume: carry out what is missing in `out`.
+        resume: carry out the runs that are missing in `out`.
 
     Returns:
         The table of runs.
@@ -159,18 +159,18 @@ def _seeds(given: object) -> Sequence[int]:
 
 def _check_limits(**given: object) -> None:
     """Raise a `ConfigurationError` if one of the arguments is no positive number; None is no limit."""
-    for what, value in given.items():
+    for name, value in given.items():
         if value is not None and not (isinstance(value, int | float) and value > 0):
-            raise ConfigurationError(f"{what} must be a number above 0, got {value!r}")
+            raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
 
 
 def _check_lists(**given: object) -> None:
     """Raise a `ConfigurationError` if one of the arguments is no list, or names nothing."""
-    for what, values in given.items():
+    for name, values in given.items():
         if isinstance(values, str) or not isinstance(values, Sequence):
-            raise ConfigurationError(f"{what} must be a list, such as [{values!r}], got {values!r}")
+            raise ConfigurationError(f"{name} must be a list, such as [{values!r}], got {values!r}")
         if not len(values):
-            raise ConfigurationError(f"{what} must name at least one, got none")
+            raise ConfigurationError(f"{name} must name at least one, got none")
 
 
 def _rows(batch: Batch, settings: Settings, out: Path | str | None, how: Execution) -> pd.DataFrame:

@@ -30,8 +30,7 @@ import pandas as pd
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
-from servobench.harness.batch.sandbox import LOST, Answer, End, Task, Tell
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import LOST, Answer, End, Task, Tell, Workers
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -131,7 +130,7 @@ def carry_out_blocks(
         workers: where.
         steps: return the tables of steps too.
         keep: results folder in which trained networks are kept beside the runs.
-        debug: raise what makes a run crash; runs stay in this process.
+        debug: raise the error of a run that crashes; runs stay in this process.
     """
     if workers.submit is None or debug:
         for block in blocks:
@@ -278,17 +277,14 @@ def _carry_out(
         for job, result in zip(block.jobs, together, strict=False):
             tell(_with_columns(job.cell, result))
         for job in block.jobs[len(together) :]:
-            tell(_carry_out_run(job, steps, keep, debug))
-
-
-def _carry_out_run(job: Job, steps: bool, keep: Path | None, debug: bool) -> RunResult:
-    try:
-        result = episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug)
-    except BaseException as error:
-        if debug or ends_batch(error):
-            raise
-        return _failed(job.cell, Ending.of(error))  # a plug-in may raise anything; the other runs go on
-    return _with_columns(job.cell, result)
+            try:
+                result = episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug)
+            except BaseException as error:
+                if debug or ends_batch(error):
+                    raise
+                tell(_failed(job.cell, Ending.of(error)))  # a plug-in may raise anything; the other runs go on
+            else:
+                tell(_with_columns(job.cell, result))
 
 
 def _with_columns(cell: Cell, result: RunResult) -> RunResult:

@@ -1,30 +1,30 @@
 """The one driver of all batches: runs into one results folder, resumable, with every failure of a run as a row.
 
-`compare`, `sweep`, `robustness` and `claims` are campaigns; `tune` uses the lower half, the module `blocks`. Each block
-of runs that is finished becomes a part of the results folder, written by this process; what is there counts. A campaign
-that is resumed carries out the runs that are missing, so that its tables are those of an undisturbed one, wall-clock
-columns aside. Runs are made when they are needed, so that the memory of this process does not grow with their number.
+`compare`, `sweep`, `robustness` and `claims` are campaigns; `tune` uses the lower half, the module `blocks`. Each
+finished block of runs becomes a part of the results folder, written by this process. A campaign that is resumed carries
+out the runs without a part, so that its tables are those of an undisturbed one, wall-clock columns aside. Runs are made
+when they are needed, so that the memory of this process does not grow with their number.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
 
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import BLOCK, CHUNK, Block, Job, build_block, carry_out_blocks, cut, even_size
-from servobench.harness.batch.checksums import writing
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
-from servobench.harness.batch.lock import Lock, check_empty, is_unused, locked
+from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
-from servobench.harness.batch.sandbox import Bounds
-from servobench.harness.batch.workers import Workers, open_workers
+from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.sandbox import Workers
+from servobench.harness.batch.tables import writing
+from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Assignment, ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once
@@ -34,7 +34,7 @@ from servobench.harness.run.resolution import ResolvedRun, check_settings, resol
 from servobench.harness.run.result import RunResult
 
 Row = dict[str, Any]
-NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that say what runs
+NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (
     "own_controllers",
     "own_plants",
@@ -54,7 +54,7 @@ class Campaign:
 
 
 def comparison(batch: Batch, settings: Settings) -> Campaign:
-    """Return the campaign of a comparison, with steps and, for the first seed, what the camera saw last."""
+    """Return the campaign of a comparison, with steps and, for the first seed, the last image of the camera."""
     first = min(batch.seeds)
 
     def cell(request: RunRequest) -> Cell:
@@ -64,9 +64,9 @@ def comparison(batch: Batch, settings: Settings) -> Campaign:
 
 
 class Observer:
-    """What a campaign reports on its way; this one does nothing."""
+    """Receives the progress of a campaign; this one does nothing."""
 
-    def training(self, share: float, what: str) -> None:
+    def training(self, share: float, subject: str) -> None:
         """Receive how much of a training of networks is done, from 0 to 1."""
 
     def begin(self, total: int, done: int) -> None:
@@ -85,11 +85,11 @@ class Execution:
 
     workers: int | None = None  # number of processes; None for the number of processors
     scheduler: str | None = None  # address of a Dask scheduler; None for processes of this machine
-    bounds: Bounds = field(default_factory=Bounds)  # what a run may take
-    resume: bool = False  # carry out what is missing in the folder
+    bounds: Bounds = field(default_factory=Bounds)  # resources of a run
+    resume: bool = False  # carry out the runs that are missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
-    debug: bool = False  # raise what makes a run crash; the runs go one by one in this process
+    debug: bool = False  # raise the error of a run that crashes; the runs go one by one in this process
 
     def of_part(self, folder: Path) -> Execution:
         """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
@@ -104,7 +104,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     Args:
         campaign: the runs.
         folder: new folder for the results; to resume, one that holds those of the same campaign.
-        how: where the runs are carried out and what receives the progress.
+        how: place and observer of the runs.
 
     Raises:
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
@@ -135,18 +135,22 @@ def _carry_out_at(
     with locked(folder, new=not how.resume) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
-        if how.resume and not is_unused(folder):  # under the lock: another process may have begun in the meantime
+        resumed = how.resume and not is_unused(folder)  # under the lock: another process may have begun meanwhile
+        if resumed:
             prepare_folder(folder, manifest, how.observer)
         else:
             results.create_folder(folder, manifest)
-        if not results.is_whole(folder, manifest["run_count"]):
-            write = partial(_write_part, folder, lock, manifest["campaign"])
-            _carry_out_missing(campaign, jobs, own, folder, place, how, write)
-        results.collect(folder)
+        if not resumed or not results.is_whole(folder, runs.count):
+            for index, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
+                with writing(folder):
+                    lock.check()  # the folder may have been removed
+                results.write_part(folder, index, outcome, manifest["campaign"])
+                how.observer.finished([result.row for result in outcome])
+        results.put_together(folder, manifest)
 
 
 def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: Workers) -> dict[str, Any]:
-    """Refuse what cannot be run, before anything is written; networks that are needed are trained.
+    """Refuse runs that are impossible, before anything is written; networks that are needed are trained.
 
     The examples among the runs are built and thrown away; in a worker process where code of users is built, which may
     fail as it likes: then its runs say so.
@@ -200,9 +204,9 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
             f"{folder} was begun with another version of {changed}; name another folder with --out, or bring "
             "the former one back"
         )
-    for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
+    for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
-            observer.note(f"note: {folder} was begun with other {what}; later runs may differ")
+            observer.note(f"note: {folder} was begun with other {things}; later runs may differ")
 
 
 class _Jobs:
@@ -248,9 +252,8 @@ def _carry_out_missing(
     folder: Path,
     place: Workers,
     how: Execution,
-    write: Callable[[int, Sequence[RunResult]], None],
-) -> None:
-    """Carry out the runs whose part is not in the folder."""
+) -> Iterator[tuple[int, list[RunResult]]]:
+    """Carry out the runs whose part is not in the folder; yield the results of each block with its first index."""
     total = len(campaign.cells)
     done = results.finished_runs(folder)
     missing = total - sum(map(len, done))
@@ -264,15 +267,7 @@ def _carry_out_missing(
     )
     keep = folder if campaign.steps and not place.cluster else None
     for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
-        write(block.index, outcome)
-        how.observer.finished([result.row for result in outcome])
-
-
-def _write_part(folder: Path, lock: Lock, campaign: str, index: int, outcome: Sequence[RunResult]) -> None:
-    """Write finished runs, unless the folder was removed meanwhile."""
-    with writing(folder):
-        lock.check()
-    results.write_part(folder, index, outcome, campaign)
+        yield block.index, outcome
 
 
 def _request(cell: Cell) -> RunRequest:
@@ -314,7 +309,7 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
     Args:
         there: manifest of the folder.
-        here: manifest of what is asked for.
+        here: manifest of the new batch.
     """
     here = json.loads(json.dumps(here, default=str))
     for key in NAMES:
@@ -328,11 +323,11 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return which file of users is no longer what two batches have in common; empty if none.
+    """Return the file of users that differs between two batches; empty if none does.
 
     Args:
-        there: manifest of the folder; what it does not tell counts as unchanged.
-        here: manifest of what is asked for.
+        there: manifest of the folder; a file that it does not mention counts as unchanged.
+        here: manifest of the new batch.
     """
     for name, digest in here["files"].items():
         if there.get("files", {}).get(name, digest) != digest:

@@ -1,4 +1,4 @@
-"""What is wrong with a results folder, and what `--resume` does about it: only what is damaged is carried out again."""
+"""The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
 from __future__ import annotations
 
@@ -7,24 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from servobench.harness.batch import results
-from servobench.harness.batch import tables as parquet
-from servobench.harness.batch.checksums import (
-    SUMS,
-    DamagedFile,
-    Sums,
-    digest,
-    fault,
-    keep_sums,
-    read_sums,
-    write_vouched,
-    writing,
-)
+from servobench.harness.batch import results, tables
 from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
-from servobench.harness.batch.tables import lacking
+from servobench.harness.batch.tables import DamagedFile, lacking, sums_of, writing
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import log_entry
+from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"
@@ -33,27 +22,27 @@ LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of fa
 
 @dataclass(frozen=True)
 class Finding:
-    """A file of a results folder with which something is wrong.
+    """A damaged file of a results folder.
 
     Attributes:
         name: of the file within the folder.
-        what: is wrong with it, as a predicate.
-        remedy: what to do, or to type.
+        fault: a predicate of the file.
+        remedy: for the user.
     """
 
     name: str
-    what: str
+    fault: str
     remedy: str
 
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found in a results folder.
+    """The result of an examination of a results folder.
 
     Attributes:
-        findings: files with which something is wrong.
-        files: number of files that were looked at.
-        runs: number of runs that are there and intact.
+        findings: damaged files.
+        files: number of examined files.
+        runs: number of intact runs.
         wanted: number of runs of the batch; 0 where the folder does not tell.
     """
 
@@ -64,36 +53,36 @@ class Examination:
 
 
 def examine(folder: Path) -> Examination:
-    """Read all files of a results folder that hold results and say what is wrong with them.
+    """Read all files of a results folder that hold results and list the damaged ones.
 
     Raises:
         ConfigurationError: there is no such folder, or nothing of a batch is in it.
     """
     check_resumable(folder)
-    sums, findings, manifest = read_sums(folder), [], {}
+    sums, findings, manifest = sums_of(folder), [], {}
     try:
         manifest = results.read_manifest(folder)
     except ConfigurationError as error:
-        wrong = error.what if isinstance(error, DamagedFile) else "cannot be read"
-        findings.append(Finding(MANIFEST, wrong, f"{AGAIN}; it is written anew if the runs are of that command"))
+        unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
+        findings.append(Finding(MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"))
     if sums is None:
         remedy = f"if you trust the files as they are: cd {folder} && sha256sum {MANIFEST} *.parquet > {SUMS}"
         findings.append(Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy))
     names = [name for name in (RUNS, STEPS, FAILURES) if (folder / name).exists() or name in (sums or {})]
-    faults = {name: what for name in names if (what := _fault(folder, name, sums))}
-    for name, what in faults.items():
+    faults = {name: wrong for name in names if (wrong := _fault(folder, name, sums))}
+    for name, wrong in faults.items():
         remedy = "it is written anew, without traces" if name == FAILURES else "runs that are in no part are repeated"
-        findings.append(Finding(name, what, f"{AGAIN}; {remedy}"))
+        findings.append(Finding(name, wrong, f"{AGAIN}; {remedy}"))
     count = 0
     for part in _parts(folder, sums, manifest.get("campaign")):
         names += part.names
         count += part.count
-        if part.what:
-            findings.append(Finding(part.wrong, part.what, f"{AGAIN}; only the runs of this part are repeated"))
+        if part.fault:
+            findings.append(Finding(part.wrong, part.fault, f"{AGAIN}; only the runs of this part are repeated"))
     strays = [path.name for path in sorted((folder / PARTS).glob("[!.]*")) if not PART.fullmatch(path.name)]
     findings += [Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays]
     if RUNS in names and not faults.keys() & {RUNS, STEPS}:
-        count = max(count, parquet.row_count(folder, RUNS))
+        count = max(count, tables.row_count(folder, RUNS))
     return Examination(findings, len(names) + 1, count, manifest.get("run_count", 0))
 
 
@@ -108,42 +97,42 @@ def check_resumable(folder: Path) -> None:
 
 
 def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Remove what is damaged of a folder whose batch is to go on, so that its runs count as missing.
+    """Remove the damaged files of a folder whose batch is to go on, so that their runs count as missing.
 
     Args:
         folder: a results folder that is locked.
         manifest: of the batch.
 
     Yields:
-        A line for each file with which something is wrong.
+        A line for each damaged file.
     """
-    sums = read_sums(folder)
+    sums = sums_of(folder)
     kept: dict[str, frozenset[str]] = {}
     with writing(folder):
         for part in _parts(folder, sums, manifest["campaign"]):
-            if part.what:
-                yield f"{folder / part.wrong} {part.what}: its runs are carried out again"
+            if part.fault:
+                yield f"{folder / part.wrong} {part.fault}: its runs are carried out again"
                 for name in reversed(part.names):  # the rows first: without them the part does not count
                     (folder / name).unlink(missing_ok=True)
             else:
                 kept |= {name: frozenset([digest(folder / name)]) for name in part.names}
         for name in (MANIFEST, RUNS, STEPS, FAILURES):
-            what = _fault(folder, name, sums) if (folder / name).exists() or name in (sums or {}) else None
+            wrong = _fault(folder, name, sums) if (folder / name).exists() or name in (sums or {}) else None
             if sums is not None and name in sums:
                 kept[name] = sums[name]
-            elif (what is None or name == MANIFEST) and (folder / name).exists():
+            elif (wrong is None or name == MANIFEST) and (folder / name).exists():
                 kept[name] = frozenset([digest(folder / name)])
-            if what and name in (RUNS, STEPS):
-                yield f"{folder / name} {what}: runs that are in no part are carried out again"
+            if wrong and name in (RUNS, STEPS):
+                yield f"{folder / name} {wrong}: runs that are in no part are carried out again"
         keep_sums(folder, kept, list(kept))
-        for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # what a process left that was killed
+        for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # remains of a process that was killed
             if PARTIAL.fullmatch(path.name):
                 path.unlink()
         if not results.is_whole(folder, manifest["run_count"]):
             (folder / PARTS).mkdir(exist_ok=True)
             return
-        if FAILURES in kept and (what := fault(folder, FAILURES, kept)):
-            yield f"{folder / FAILURES} {what}: it is written anew, without traces"
+        if FAILURES in kept and (wrong := fault(folder, FAILURES, kept)):
+            yield f"{folder / FAILURES} {wrong}: it is written anew, without traces"
             write_vouched(folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")})
 
 
@@ -172,25 +161,25 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
         return ""
     names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
     names += [RUNS] if (folder / RUNS).exists() else []
-    sums = read_sums(folder)
+    sums = sums_of(folder)
     intact = [name for name in names if _fault(folder, name, sums) is None]  # the others are made again in any case
-    owners = {parquet.owner(folder, name).partition("@")[0] for name in intact}
+    owners = {tables.owner(folder, name).partition("@")[0] for name in intact}
     if owners - {manifest["campaign"]} or not owners:
         raise ConfigurationError(
-            f"{folder / MANIFEST} {damage.what}, and the tables are not of this batch or do not say so; "
+            f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "
             "restore the file from a copy, or name another folder with --out"
         ) from damage
     with writing(folder):
         results.write_manifest(folder, manifest)
-    return f"{folder / MANIFEST} {damage.what}: it is written anew"
+    return f"{folder / MANIFEST} {damage.fault}: it is written anew"
 
 
 @dataclass(frozen=True)
 class _Part:
     names: list[str]  # of its files within the folder, rows last
     count: int  # of its runs that are intact
-    wrong: str = ""  # name of the file with which something is wrong
-    what: str = ""  # is wrong with it
+    wrong: str = ""  # name of its damaged file
+    fault: str = ""  # of that file
 
 
 def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_Part]:
@@ -199,10 +188,10 @@ def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_P
     for index in results.part_indices(folder):
         names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
         names = [name for name in names if (folder / name).exists() or name in (sums or {})]
-        faults = [(name, what) for name in names if (what := _fault(folder, name, sums))]
+        faults = [(name, wrong) for name in names if (wrong := _fault(folder, name, sums))]
         rows = results.part_name(index, RUNS)
         if not faults:
-            batch, _, first = parquet.owner(folder, rows).rpartition("@")
+            batch, _, first = tables.owner(folder, rows).rpartition("@")
             if batch not in ("", campaign or batch):
                 faults = [(rows, "holds the rows of another batch")]
             elif first not in ("", f"{index}"):
@@ -212,27 +201,27 @@ def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_P
         if faults:
             yield _Part(names, 0, *faults[0])
         else:
-            count = parquet.row_count(folder, rows)
+            count = tables.row_count(folder, rows)
             end = index + count
             yield _Part(names, count)
 
 
 def _fault(folder: Path, name: str, sums: Sums | None) -> str | None:
-    """Return what is wrong with a file; a table that nothing vouches for is read as a whole."""
-    what = fault(folder, name, sums)
-    if what is None and sums is None and name.endswith(".parquet"):
+    """Return the fault of a file; a table without a checksum is read as a whole."""
+    wrong = fault(folder, name, sums)
+    if wrong is None and sums is None and name.endswith(".parquet"):
         try:
-            columns = parquet.common_schema(folder, [name]).names
-            for _ in parquet.row_groups(folder, name, columns):
+            columns = tables.common_schema(folder, [name]).names
+            for _ in tables.row_groups(folder, name, columns):
                 pass
-            what = lacking("runs" if name.endswith(RUNS) else "steps", columns) or None
+            wrong = lacking("runs" if name.endswith(RUNS) else "steps", columns) or None
         except DamagedFile as error:
-            return error.what
-    return what
+            return error.fault
+    return wrong
 
 
 def _log(folder: Path) -> str:
-    """Return the log of failures as far as the table of runs tells it."""
-    tables = parquet.row_groups(folder, RUNS, LOGGED)
-    rows = (dict(zip(table.columns, row, strict=True)) for table in tables for row in table.to_numpy())
+    """Return the log of failures as far as it can be made from the table of runs."""
+    groups = tables.row_groups(folder, RUNS, LOGGED)
+    rows = (dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy())
     return "".join(log_entry(row, "") for row in rows)

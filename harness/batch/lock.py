@@ -1,9 +1,9 @@
 """One process at a time in a results folder, and who it is.
 
-The lock is `flock` on the file `.lock`: the system releases it when the process ends, however it ends. The file says
-who holds it. Where the file system has no such locks (some network mounts) or the system has none (Windows), the file
-itself is the lock: the process that could create it holds it, until that process is known to have ended. A process of
-another machine cannot be looked at, so there the file stays until someone removes it.
+The lock is `flock` on the file `.lock`, which the system releases when the process ends. The file names its holder.
+Where the file system has no such locks (some network mounts), the existence of the file is the lock: the process that
+created it holds it, until that process is known to have ended. The processes of another machine are out of reach, so
+there the file stays until a user removes it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from servobench.harness.batch.checksums import SUMS
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.files import PARTIAL
 
 LOCK = ".lock"
@@ -41,7 +41,7 @@ class Holder:
 
     @classmethod
     def this_process(cls) -> Holder:
-        """Return what this process writes into a lock."""
+        """Return the entry of this process in a lock."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         return cls(_user(), platform.node(), os.getpid(), now, _start_of(os.getpid()))
 
@@ -61,24 +61,9 @@ class Holder:
         return f"process {self.pid} of {self.owner} on {self.host}, since {self.begun}"
 
     @property
-    def here(self) -> bool:
-        """Whether it is a process of this machine."""
-        return self.host == platform.node()
-
-    @property
     def gone(self) -> bool:
         """Whether it is known to have ended; never for a process of another machine."""
-        if not self.here or os.name == "nt":  # there is no harmless way to ask on Windows
-            return False
-        if self.pid <= 0:  # no process, but a group of them
-            return True
-        try:
-            os.kill(self.pid, 0)
-        except (ProcessLookupError, OverflowError):
-            return True
-        except OSError:  # of another user
-            return False
-        return self.started != _start_of(self.pid)
+        return self.host == platform.node() and self.started != _start_of(self.pid)
 
 
 class Lock:
@@ -160,12 +145,11 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
 
 
 def _open(path: Path) -> tuple[int, bool]:
-    """Open the file of a lock and return whether it was created; Windows removes it when its process ends."""
-    flags = os.O_RDWR | getattr(os, "O_TEMPORARY", 0)
+    """Open the file of a lock and return whether it was created."""
     try:
-        return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
     except FileExistsError:
-        return os.open(path, flags), False
+        return os.open(path, os.O_RDWR), False
 
 
 def _flock(descriptor: int) -> bool:
@@ -231,14 +215,14 @@ def _start_of(pid: int) -> str:
 
 
 def check_empty(folder: Path, *, can_resume: bool = False) -> None:
-    """Refuse a folder with anything in it but what a batch leaves that could not begin.
+    """Refuse a folder with anything in it but the remains of a batch that could not begin.
 
     Args:
         folder: that is to be made.
         can_resume: whether the batch could go on in it.
 
     Raises:
-        ConfigurationError: it has, or it cannot be looked at.
+        ConfigurationError: it has, or it cannot be read.
     """
     try:
         taken = folder.exists() and not is_unused(folder)
@@ -250,7 +234,7 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
 
 
 def is_unused(folder: Path) -> bool:
-    """Return whether a folder is empty, or holds only what a batch leaves that ended before its first run."""
+    """Return whether a folder is empty, or holds only the remains of a batch that ended before its first run."""
     if not folder.is_dir():
         return False
     try:

@@ -92,7 +92,7 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
 
 
 def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by nested keys of those by dotted keys; what was not set is left out."""
+    """Return settings by nested keys of those by dotted keys; settings without a value are left out."""
     nested: dict[str, Any] = {}
     for key, value in flat.items():
         *path, name = key.split(".")

@@ -1,4 +1,4 @@
-"""What a results folder says about how it was made: resolved configuration, versions, seeds, git commit."""
+"""The manifest of a results folder: resolved configuration, versions, seeds, git commit, checksums of named files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.batch.checksums import digest
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import git_commit, installed_version
 from servobench.harness.config.registry import MAPPED, Offer, find_plant, published
@@ -20,6 +19,7 @@ from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
 from servobench.harness.run.tasks import published_task
 from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.mismatch import Mismatch
 
@@ -38,7 +38,7 @@ PACKAGES = (
 )
 
 
-OWN = {  # keys of the place and the hash of what users gave as a file or an object, by what it is
+OWN = {  # keys of the place and the hash of a file or an object of users, by its kind
     "controller": "own_controllers",
     "plant": "own_plants",
     "task": "own_tasks",
@@ -56,7 +56,7 @@ def describe_batch(
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
     Args:
-        runs: what was asked for.
+        runs: of the batch.
         sections: their typed settings by section, as `servobench.harness.run.resolution.resolve_sections` returns them.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
         own: controllers and plants that users gave.
@@ -100,13 +100,13 @@ def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
-    """Return what a manifest says about a sensing set-up: its features."""
+    """Return the entry of a sensing set-up in a manifest: its features."""
     eye = find_sensing(word).setup
     return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras}
 
 
 def describe_robot(name: str) -> dict[str, Any]:
-    """Return what a manifest says about a robot: the nominal arm, its source and what was assumed."""
+    """Return the entry of a robot in a manifest: the nominal arm, its source and its assumptions."""
     robot = find_robot(name)
     arm, limits, work = robot.arm, robot.limits, robot.workspace
     numbers = {
@@ -125,7 +125,7 @@ def describe_robot(name: str) -> dict[str, Any]:
 
 
 MAPPING: Final = ".toml"
-SETTING: Final = "file"  # what the settings that name a file are called
+SETTING: Final = "file"  # name of the settings that hold the name of a file
 
 
 def named_files(
@@ -134,7 +134,7 @@ def named_files(
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
     Args:
-        runs: what was asked for.
+        runs: of the batch.
         configuration: settings by section and key.
         own: controllers and plants of the user. A module that their file imports from its own folder is named as if the
             user had written it.
@@ -163,7 +163,7 @@ def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]]) -> Iter
 
 
 def _code(place: str, file: Path) -> dict[str, Path]:
-    """Return a file of code and what it imports from its own folder, by the names that they have from its place."""
+    """Return a file of code and the modules that it imports from its own folder, by their names from its place."""
     found = PLACE.fullmatch(place)
     if found is not None and found["module"]:
         deep = found["module"].count(".") + (file.name == "__init__.py")

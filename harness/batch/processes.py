@@ -1,4 +1,4 @@
-"""The processes below one: their ids, their memory, their end; and the ties of a process to the one above.
+"""Limits of runs, and the processes below one: their ids, their memory, their end, their ties to the one above.
 
 The one module that imports psutil. On Linux a process can adopt the orphans among its descendants, so that a child
 that was started in a session of its own, with its parent gone, also stays below the process that answers for it.
@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
+import re
 import signal
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +24,39 @@ import psutil
 LINUX: Final = sys.platform == "linux"
 LISTED: Final = Path("/proc/thread-self/children").exists()  # whether the system lists the children of a process
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
+FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
+FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
+LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least
 END_TIME, END_PAUSE = 5.0, 0.01  # [s] until all processes below this one have ended, and between two checks
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Resources of a run; None for no limit."""
+
+    time: float | None = None  # [s] from one answer to the next
+    memory: int | None = None  # [bytes] of a run and the processes that it starts
+    addresses: bool = False  # refuse each process more than this memory at once, even if it never touches it
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Resources of the runs of a batch as a user gives them, and whether code of users stays out of this process."""
+
+    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
+    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
+    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in sandboxes
+
+    def limits(self, count: int, *, foreign: bool) -> Limits:
+        """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
+        time, memory = self.run_timeout, self.run_memory
+        if foreign:
+            machine = machine_memory()
+            time = FOREIGN_TIME if time is None else time
+            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine / count) if memory is None else memory
+        seconds = None if time is None or math.isinf(time) else time
+        size = None if memory is None or math.isinf(memory) else int(memory)
+        return Limits(seconds, size, addresses=self.run_memory is not None)
 
 
 def lead_session() -> None:
@@ -141,3 +176,25 @@ def collect_ended(processes: Iterable[int]) -> None:
     for process in processes:
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, os.WNOHANG)
+
+
+def read_size(text: str) -> float:
+    """Return the number of bytes that a text such as "500MB", "2GB" or "inf" names.
+
+    Raises:
+        ValueError: it names none.
+    """
+    if text.strip().lower() == "inf":
+        return math.inf
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)i?B\s*", text, re.IGNORECASE)
+    if found is None or not float(found[1]):
+        raise ValueError(f"a memory limit is a size such as 500MB or 2GB, or inf for none; got {text!r}")
+    return int(float(found[1]) * 1000 ** " KMGT".index(found[2].upper() or " "))
+
+
+def show_size(size: int) -> str:
+    """Return a number of bytes as a user writes it."""
+    for unit, one in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= one:
+            return f"{size / one:.3g} {unit}"
+    return f"{size} B"

@@ -2,8 +2,8 @@
 
 While runs are under way, finished ones lie below `parts/`: a group of files for each run or block of runs, each written
 atomically, rows last, so that a part counts once its rows are there. At the end the parts are put together. If the
-process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts together what there is. A file that
-is not what was written is refused by name: `SHA256SUMS` vouches for all of them.
+process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts the finished ones together. A file
+that was changed since is refused by name: `SHA256SUMS` has the checksums of all of them.
 """
 
 from __future__ import annotations
@@ -22,22 +22,12 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from servobench.harness.batch import tables as parquet
-from servobench.harness.batch.checksums import (
-    SUMS,
-    DamagedFile,
-    Sums,
-    digest,
-    fault,
-    keep_sums,
-    read_sums,
-    write_vouched,
-    writing,
-)
+from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, check_empty
-from servobench.harness.batch.tables import refuse_lacking, refuse_nameless
+from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult, log_entry
+from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.files import PARTIAL, write_atomically
 
 if TYPE_CHECKING:
@@ -95,11 +85,11 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     files: dict[str, Callable[[Path], object]] = {}
     if steps:
         frame = pa.Table.from_pandas(pd.concat(steps, ignore_index=True), preserve_index=False)
-        files[part_name(index, STEPS)] = partial(parquet.write_table, frame.replace_schema_metadata())
+        files[part_name(index, STEPS)] = partial(tables.write_table, frame.replace_schema_metadata())
     if failures:
         files[part_name(index, FAILURES)] = _text(failures)
-    rows = parquet.as_table([result.row for result in outcome])
-    files[part_name(index, RUNS)] = partial(parquet.write_table, rows, batch=f"{campaign}@{index}")
+    rows = tables.as_table([result.row for result in outcome])
+    files[part_name(index, RUNS)] = partial(tables.write_table, rows, batch=f"{campaign}@{index}")
     with writing(folder):
         for result in outcome:
             if result.picture is not None:
@@ -116,21 +106,21 @@ def _write_picture(path: Path, picture: ImageArray) -> None:
     write_atomically(path, lambda file: file.write_bytes(content))
 
 
-def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
+def write_summary(folder: Path, sweeps: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
     """Make a folder that holds several sweeps a results folder itself: one table of all their runs.
 
     Args:
         folder: the folder.
-        tables: tables of runs by the name of the sweep; it becomes the column `part`.
+        sweeps: tables of runs by the name of the sweep; it becomes the column `part`.
         manifest: of the whole.
 
     Raises:
         UnwritableFolder: the folder takes no more files.
     """
-    runs = pd.concat([table.assign(part=name) for name, table in tables.items()], ignore_index=True)
+    runs = pd.concat([table.assign(part=name) for name, table in sweeps.items()], ignore_index=True)
     rows = pa.Table.from_pandas(runs, preserve_index=False).replace_schema_metadata()
     with writing(folder):
-        write_vouched(folder, {RUNS: partial(parquet.write_table, rows)})
+        write_vouched(folder, {RUNS: partial(tables.write_table, rows)})
         write_manifest(folder, manifest)
 
 
@@ -148,16 +138,16 @@ def part_names(folder: Path, kind: str, sums: Sums | None) -> list[str]:
 
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
-    return [range(own, own + parquet.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]
+    return [range(own, own + tables.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]
 
 
 def is_whole(folder: Path, wanted: int) -> bool:
-    """Return whether the tables of a folder are what was written, and have at least as many runs as are wanted."""
-    sums = read_sums(folder)
+    """Return whether the tables of a folder are undamaged, and have at least as many runs as are wanted."""
+    sums = sums_of(folder)
     if any(fault(folder, name, sums) for name in (RUNS, STEPS) if name == RUNS or _expected(folder, name, sums)):
         return False
     with contextlib.suppress(DamagedFile):
-        return parquet.row_count(folder, RUNS) >= wanted
+        return tables.row_count(folder, RUNS) >= wanted
     return False
 
 
@@ -168,15 +158,19 @@ def collect(folder: Path) -> int:
         Number of runs.
 
     Raises:
-        ConfigurationError: there are no parts and no tables, or a file is not what was written.
+        ConfigurationError: there are no parts and no tables, or a file is damaged.
         UnwritableFolder: the folder takes no more files.
     """
-    manifest = read_manifest(folder)
+    return put_together(folder, read_manifest(folder))
+
+
+def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
+    """Put the parts of a folder with this manifest together; result and errors are those of `collect`."""
     wanted, campaign = manifest.get("run_count", 0), manifest.get("campaign", "")
     if is_whole(folder, wanted):  # at most the clean-up is left
         shutil.rmtree(folder / PARTS, ignore_errors=True)
-        return parquet.row_count(folder, RUNS)
-    sums = read_sums(folder)
+        return tables.row_count(folder, RUNS)
+    sums = sums_of(folder)
     if not part_indices(folder):
         _refuse_damaged(folder, [name for name in (RUNS, STEPS) if _expected(folder, name, sums)])
         raise ConfigurationError(f"{folder} holds no finished run")
@@ -187,10 +181,10 @@ def collect(folder: Path) -> int:
         if names and kind == FAILURES:
             files[kind] = _text("".join((folder / name).read_text(encoding="utf-8") for name in names))
         elif names:
-            files[kind] = partial(parquet.join, folder, names, campaign)
+            files[kind] = partial(tables.join, folder, names, campaign)
     with writing(folder):
         write_vouched(folder, files)
-        count = parquet.row_count(folder, RUNS)
+        count = tables.row_count(folder, RUNS)
         if count >= wanted:
             own = [MANIFEST, *files]
             keep_sums(folder, {name: frozenset([digest(folder / name)]) for name in own}, own)
@@ -202,12 +196,12 @@ def load_runs(folder: Path) -> pd.DataFrame:
     """Return the table of runs of a results folder, also of one whose batch was killed.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema, a file of it is not what was written, or the
+        ConfigurationError: not a results folder, one of another schema, a file of it is damaged, or the
             table lacks a column that says which run a row is, or a run's identifier is unfit for the name of a file.
     """
     check_folder(folder)
     names = _intact(folder, RUNS)
-    runs = parquet.read_tables(folder, names)
+    runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", runs.columns)
     refuse_nameless(folder / names[0], runs)
     return runs
@@ -219,7 +213,7 @@ def describe_missing(folder: Path) -> str:
     Raises:
         ConfigurationError: as for `load_runs`.
     """
-    count = sum(parquet.row_count(folder, name) for name in _intact(folder, RUNS))
+    count = sum(tables.row_count(folder, name) for name in _intact(folder, RUNS))
     return missing_line(count, read_manifest(folder).get("run_count", 0))
 
 
@@ -231,7 +225,7 @@ def missing_line(count: int, wanted: int) -> str:
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
     """Yield the table of runs of a finished batch, some thousand rows at a time and those of `columns` it has."""
     _refuse_damaged(folder, [RUNS])
-    return parquet.row_groups(folder, RUNS, columns)
+    return tables.row_groups(folder, RUNS, columns)
 
 
 def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collection[str] | None = None) -> pd.DataFrame:
@@ -248,8 +242,8 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     check_folder(folder)
     names = _intact(folder, STEPS)
     for name in names:
-        refuse_lacking(folder / name, "steps", parquet.common_schema(folder, [name]).names)
-    steps = parquet.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
+        refuse_lacking(folder / name, "steps", tables.common_schema(folder, [name]).names)
+    steps = tables.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps
@@ -261,10 +255,10 @@ def has_steps(folder: Path) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse what is not a results folder of this schema.
+    """Refuse a folder without results of this schema.
 
     Raises:
-        ConfigurationError: says what is missing or different.
+        ConfigurationError: names the missing file or the other schema.
     """
     read_manifest(folder)
     if not (folder / RUNS).is_file() and not part_indices(folder):
@@ -275,9 +269,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a results folder.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema, or the manifest is not what was written.
+        ConfigurationError: not a results folder, one of another schema, or the manifest is damaged.
     """
-    if _expected(folder, MANIFEST, read_sums(folder)):
+    if _expected(folder, MANIFEST, sums_of(folder)):
         _refuse_damaged(folder, [MANIFEST])
     try:
         text = (folder / MANIFEST).read_text(encoding="utf-8")
@@ -292,22 +286,22 @@ def _expected(folder: Path, name: str, sums: Sums | None) -> bool:
 
 
 def _intact(folder: Path, kind: str) -> list[str]:
-    """Return the names of the table of one kind, or of the parts of it, each of which is what was written."""
-    names = [kind] if (folder / kind).is_file() else part_names(folder, kind, read_sums(folder))
+    """Return the names of the table of one kind, or of its parts, all of them undamaged."""
+    names = [kind] if (folder / kind).is_file() else part_names(folder, kind, sums_of(folder))
     _refuse_damaged(folder, names)
     return names
 
 
 def _refuse_damaged(folder: Path, names: Sequence[str]) -> None:
-    """Refuse files that are not what was written.
+    """Refuse damaged files.
 
     Raises:
         DamagedFile: names the first of them.
     """
-    sums = read_sums(folder)
+    sums = sums_of(folder)
     for name in names:
-        if (what := fault(folder, name, sums)) is not None:
-            raise DamagedFile(folder, name, what)
+        if (wrong := fault(folder, name, sums)) is not None:
+            raise DamagedFile(folder, name, wrong)
 
 
 def _text(text: str) -> Callable[[Path], object]:
@@ -332,7 +326,7 @@ def encode(manifest: Mapping[str, Any]) -> str:
 
 
 def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
-    """Return what a manifest says.
+    """Return the entries of a manifest.
 
     Args:
         folder: the results folder, for the message.
@@ -360,7 +354,7 @@ def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
     return dict(manifest)
 
 
-def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
+def _in_json(value: Any) -> Any:  # noqa: ANN401 - any entry of a manifest
     if isinstance(value, dict):
         return {key: _in_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -368,6 +362,6 @@ def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _has_type(value: Any, kind: type, inner: type | None = None) -> bool:  # noqa: ANN401 - whatever JSON holds
+def _has_type(value: Any, kind: type, inner: type | None = None) -> bool:  # noqa: ANN401 - any JSON
     elements = value.values() if isinstance(value, dict) else value
     return type(value) is kind and (inner is None or all(type(each) is inner for each in elements))

@@ -16,10 +16,8 @@ import contextlib
 import faulthandler
 import gc
 import json
-import math
 import os
 import pickle
-import re
 import signal
 import sys
 import tempfile
@@ -38,6 +36,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch import processes
+from servobench.harness.batch.processes import Limits, show_size
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
 
@@ -50,44 +49,13 @@ GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a mach
 GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
+TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
 MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
 KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
-FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
-FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
-LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
 
 Tell: TypeAlias = Callable[[Any], None]  # passes an answer of JSON values up; None is only a sign of life
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Resources of a run; None for no limit."""
-
-    time: float | None = None  # [s] from one answer to the next
-    memory: int | None = None  # [bytes] of a run and the processes that it starts
-    addresses: bool = False  # refuse each process more than this memory at once, even if it never touches it
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Resources of the runs of a batch as a user gives them, and whether code of users stays out of this process."""
-
-    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
-    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
-    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in sandboxes
-
-    def limits(self, count: int, *, foreign: bool) -> Limits:
-        """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
-        time, memory = self.run_timeout, self.run_memory
-        if foreign:
-            machine = processes.machine_memory()
-            time = FOREIGN_TIME if time is None else time
-            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine / count) if memory is None else memory
-        seconds = None if time is None or math.isinf(time) else time
-        size = None if memory is None or math.isinf(memory) else int(memory)
-        return Limits(seconds, size, addresses=self.run_memory is not None)
 
 
 @dataclass(frozen=True)
@@ -119,6 +87,21 @@ class Answer:
 
     items: list[Any] = field(default_factory=list)
     end: End | None = None
+
+
+@dataclass(frozen=True)
+class Workers:
+    """A place where tasks are carried out: this process, sandboxes or a cluster."""
+
+    submit: Callable[..., Any] | None = None  # takes a `Task` and returns a future; None: runs stay in this process
+    count: int = 1  # number of tasks that are carried out at a time
+    cluster: bool = False  # whether runs happen on other machines
+    lost: tuple[type[BaseException], ...] = ()  # errors of a future whose process died
+
+    @property
+    def window(self) -> int:
+        """How many tasks are handed out at a time."""
+        return TASKS_PER_WORKER * self.count
 
 
 def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell) -> Ending | None:
@@ -494,25 +477,3 @@ def _describe_exit(code: int | None) -> str:
     with contextlib.suppress(ValueError):
         return f": {signal.Signals(-code).name}"
     return f": signal {-code}"
-
-
-def read_size(text: str) -> float:
-    """Return the number of bytes that a text such as "500MB", "2GB" or "inf" names.
-
-    Raises:
-        ValueError: it names none.
-    """
-    if text.strip().lower() == "inf":
-        return math.inf
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)i?B\s*", text, re.IGNORECASE)
-    if found is None or not float(found[1]):
-        raise ValueError(f"a memory limit is a size such as 500MB or 2GB, or inf for none; got {text!r}")
-    return int(float(found[1]) * 1000 ** " KMGT".index(found[2].upper() or " "))
-
-
-def show_size(size: int) -> str:
-    """Return a number of bytes as a user writes it."""
-    for unit, one in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
-        if size >= one:
-            return f"{size / one:.3g} {unit}"
-    return f"{size} B"

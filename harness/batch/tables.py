@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,11 +14,55 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from servobench.harness.batch.checksums import DamagedFile
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
-BATCH: Final = b"servobench.batch"  # key of what a table says about whose rows it holds
+BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
+
+
+class DamagedFile(ConfigurationError):
+    """A file of a results folder was changed since it was written, or is missing."""
+
+    def __init__(self, folder: Path, name: str, fault: str) -> None:
+        """Name the file, its fault and the remedy."""
+        self.fault = fault
+        remedy = f"repeat the command that made the folder with --resume, or type: servobench verify {folder}"
+        super().__init__(f"{folder / name} {fault}; {remedy}")
+
+
+class UnwritableFolder(OSError):
+    """The results folder takes no more files."""
+
+
+@contextlib.contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Name the results folder where the system refuses to write.
+
+    Raises:
+        UnwritableFolder: it did.
+    """
+    try:
+        yield
+    except UnwritableFolder:
+        raise
+    except OSError as error:
+        why = error.strerror or str(error) or type(error).__name__
+        if error.errno == errno.ENOENT and not folder.is_dir():
+            why = "it was removed"
+        raise UnwritableFolder(error.errno, f"results folder {folder} cannot be written: {why}") from error
+
+
+def sums_of(folder: Path) -> Sums | None:
+    """Return the lines of a results folder; None where it has none, as one of an earlier version.
+
+    Raises:
+        ConfigurationError: they cannot be read.
+    """
+    try:
+        return read_sums(folder)
+    except OSError as error:
+        raise ConfigurationError(f"{folder / SUMS} cannot be read: {error.strerror}") from error
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
@@ -46,7 +91,7 @@ def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
 
 
 def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
-    """Write tables as one, holding few rows in memory; what a table lacks is null."""
+    """Write tables as one, holding few rows in memory; the columns that a table lacks are null."""
     schema = common_schema(folder, names)
     waiting = schema.empty_table()
     with path.open("wb") as target, _writer(target, schema.with_metadata({BATCH: batch} if batch else None)) as writer:
@@ -166,7 +211,7 @@ def refuse_lacking(path: Path, kind: str, columns: Collection[str]) -> None:
     """Refuse a table that is none of runs or steps.
 
     Raises:
-        ConfigurationError: names the table and what it lacks.
+        ConfigurationError: names the table and the columns that it lacks.
     """
     if lack := lacking(kind, columns):
         raise ConfigurationError(f"{path} is no table of {kind}: it {lack}")

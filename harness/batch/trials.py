@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.batch.sandbox import LOST, Bounds, Tell, call
+from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.sandbox import LOST, Tell, call
 from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import (
     MAPPED,

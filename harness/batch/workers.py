@@ -9,33 +9,17 @@ import contextlib
 import os
 import pickle
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from servobench.harness.batch.sandbox import POSSIBLE, Answer, Bounds, Limits, Pool, Task
+from servobench.harness.batch.processes import Bounds, Limits
+from servobench.harness.batch.sandbox import POSSIBLE, Answer, Pool, Task, Workers
 from servobench.harness.config.registry import Offer, is_foreign_controller, is_foreign_plant, own_modules
 from servobench.harness.config.settings import ConfigurationError
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
-TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
-
-
-@dataclass(frozen=True)
-class Workers:
-    """A place where runs are carried out."""
-
-    submit: Callable[..., Any] | None = None  # takes a `Task` and returns a future; None: runs stay in this process
-    count: int = 1  # number of tasks that are carried out at a time
-    cluster: bool = False  # whether runs happen on other machines
-    lost: tuple[type[BaseException], ...] = ()  # what a future raises if the process that carried out its task died
-
-    @property
-    def window(self) -> int:
-        """How many tasks are handed out at a time."""
-        return TASKS_PER_WORKER * self.count
 
 
 def default_workers() -> int:
@@ -72,7 +56,7 @@ def open_workers(
         count: number of processes on this machine; with 1, methods of this package on its plants are carried out in
             this process unless a limit is given. None for the number of processors.
         scheduler: address of a Dask scheduler, such as "tcp://127.0.0.1:8786"; None for processes of this machine.
-        bounds: what a run may take.
+        bounds: resources of a run.
         plants: names of the plants of the runs.
         controllers: names of the controllers.
         own: controllers and plants that users gave.

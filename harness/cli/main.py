@@ -143,7 +143,7 @@ def _usage_line(error: typer.TyperException) -> str:
 
 def _line_of_system(error: OSError) -> str | None:
     """Return the one-line error for a folder in which no file can be written; None for a defect."""
-    from servobench.harness.batch.checksums import UnwritableFolder
+    from servobench.harness.batch.tables import UnwritableFolder
 
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)

@@ -22,7 +22,7 @@ from servobench.harness.cli.terminal import refuse
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
     from servobench.harness.batch.plan import Batch
-    from servobench.harness.batch.sandbox import Bounds
+    from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
 ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
@@ -228,7 +228,7 @@ class Limited:
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
-        from servobench.harness.batch.sandbox import Bounds, read_size
+        from servobench.harness.batch.processes import Bounds, read_size
 
         try:
             memory = None if self.run_memory is None else read_size(self.run_memory)

@@ -119,7 +119,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(f"{folder} is being written by {holder}")
     found = examine(folder)
     for finding in found.findings:
-        say(f"{folder / finding.name} {finding.what}: {finding.remedy}")
+        say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
     if line := missing_line(found.runs, found.wanted):
         say(line)
     if found.findings:

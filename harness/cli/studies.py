@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from servobench.harness.batch.workers import Workers
+    from servobench.harness.batch.sandbox import Workers
     from servobench.harness.studies.tuning.campaign import Change, Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 

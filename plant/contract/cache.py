@@ -1,7 +1,7 @@
 """The user's cache folder: entries with checksums, made once, and made again where they are damaged.
 
-    <cache>/servobench/<kind>/<key>/files/...     its files
-    <cache>/servobench/<kind>/<key>/seal.json     the SHA-256 of each of these files
+    <cache>/servobench/<kind>/<key>/files/...      the files
+    <cache>/servobench/<kind>/<key>/SHA256SUMS     their checksums
 
 An entry appears whole or not at all, also if several processes make it at once. A process verifies it once, so that a
 flipped bit or a file cut short never reaches a run. Entries that were not used for long are removed.
@@ -10,8 +10,6 @@ flipped bit or a file cut short never reaches a run. Entries that were not used 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
 import shutil
 import tempfile
@@ -22,8 +20,9 @@ from typing import Final
 
 from platformdirs import user_cache_path
 
+from servobench.plant.contract.checksums import append_sums, digest, fault, read_sums
+
 FILES: Final = "files"
-SEAL: Final = "seal.json"
 UNFINISHED: Final = ".unfinished-"
 MAX_ENTRIES: Final = 32  # of a kind that are kept where they are older than `MIN_AGE`
 MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
@@ -60,11 +59,10 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
 
 def is_whole(entry: Path) -> bool:
     """Return whether the files of an entry are there as they were made; additional files do not matter."""
-    try:
-        sums = json.loads((entry / SEAL).read_text(encoding="utf-8"))
-        return bool(sums) and all(_sum(entry / FILES / name) == wanted for name, wanted in sums.items())
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
-        return False
+    with contextlib.suppress(OSError):
+        sums = read_sums(entry) or {}
+        return bool(sums) and all(fault(entry, name, sums) is None for name in sums)
+    return False
 
 
 def _make(entry: Path, make: Callable[[Path], object]) -> None:
@@ -76,7 +74,8 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
         try:
             (fresh / FILES).mkdir()
             make(fresh / FILES)
-            _seal(fresh)
+            files = [path for path in sorted((fresh / FILES).rglob("*")) if path.is_file()]
+            append_sums(fresh, {path.relative_to(fresh).as_posix(): digest(path) for path in files})
             with _alone(kind):
                 if not is_whole(entry):  # else another process was faster
                     _remove(entry)
@@ -89,17 +88,6 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
             f"cache folder {kind} cannot be written: {error.strerror or error}; make room there, "
             "or let XDG_CACHE_HOME name another place"
         ) from error
-
-
-def _seal(entry: Path) -> None:
-    files = [path for path in sorted((entry / FILES).rglob("*")) if path.is_file()]
-    sums = {path.relative_to(entry / FILES).as_posix(): _sum(path) for path in files}
-    (entry / SEAL).write_text(json.dumps(sums, indent=1), encoding="utf-8")
-
-
-def _sum(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _remove(entry: Path) -> None:

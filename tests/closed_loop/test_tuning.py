@@ -13,7 +13,7 @@ from kit.tuning import SMALL, cost_by_formula, read_tuned
 from servobench import controllers
 from servobench.controllers.aids import EQUIPPED
 from servobench.harness.batch.plan import TUNING
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import apply_settings, default_config
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import flatten

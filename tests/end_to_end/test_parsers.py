@@ -65,9 +65,8 @@ PASSED_OVER: tuple[tuple[str, str], ...] = (  # what does not keep a folder from
     ("lock", HOLDER.replace('"pid": 4', '"pid": 1e999')),
     ("lock", HOLDER.replace('"pid": 4', '"pid": -1')),
     ("lock", HOLDER.replace('"pid": 4', '"pid": 9999999999999999999999')),
-    ("seal", "[" * 3000),
-    ("seal", '{"a": {}}'),
-    ("seal", "7"),
+    ("cache entry", "[" * 3000),
+    ("cache entry", "7  files/a/b.txt\n"),
 )
 
 

@@ -15,13 +15,13 @@ from PIL import Image
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
-from servobench.harness.batch.checksums import write_vouched
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.figures import HEADINGS, draw_figures, folder_figures, page_figures
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import path_views
 from servobench.harness.pictures.style import ENDED, NARROW, TEXT, WIDE, figure_style, fitted, method_styles, picture_of
 from servobench.harness.pictures.tracks import Track, load_groups
+from servobench.plant.contract.checksums import write_vouched
 
 OTHERS = [f"method_{i}" for i in range(20)]
 

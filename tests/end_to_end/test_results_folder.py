@@ -18,7 +18,7 @@ from night import file_faults
 from servobench.harness.batch import campaign, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
-from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.scoring import Ledger
 

@@ -17,8 +17,7 @@ from servobench.harness.batch import blocks, results
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, parse_variation, survey
-from servobench.harness.batch.sandbox import Answer, End
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Answer, End, Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import identity
 from servobench.harness.run.request import RunRequest

@@ -14,14 +14,14 @@ import pytest
 
 from kit.command import judged
 from kit.folders import made_up_row
-from servobench.harness.batch import results
-from servobench.harness.batch import tables as parquet
+from servobench.harness.batch import results, tables
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
-from servobench.harness.batch.checksums import SUMS, DamagedFile, fault, read_sums
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.tables import DamagedFile
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.plant.contract.checksums import SUMS, fault, read_sums
 
 pytestmark = pytest.mark.xdist_group("integrity")  # one process makes what these tests share
 
@@ -114,7 +114,7 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, who
             command(folder)
     found = examine(folder)
     (finding,) = found.findings
-    assert (finding.name, finding.what) == (results.part_name(8, results.RUNS), what)
+    assert (finding.name, finding.fault) == (results.part_name(8, results.RUNS), what)
     assert found.runs == RUNS - 16
     resumed = run(folder, resume=True)
     assert resumed.repeated == 16
@@ -126,9 +126,9 @@ def test_a_part_with_the_rows_of_another_is_refused(half, whole, tmp_path):
     folder = copy(half, tmp_path)
     first, second = (folder / results.part_name(index, results.RUNS) for index in (0, 8))
     shutil.copy(first, second)
-    assert [finding.what for finding in examine(folder).findings] == ["was changed since it was written"]
+    assert [finding.fault for finding in examine(folder).findings] == ["was changed since it was written"]
     (folder / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
-    assert "holds the rows of other runs" in [finding.what for finding in examine(folder).findings]
+    assert "holds the rows of other runs" in [finding.fault for finding in examine(folder).findings]
     assert run(folder, resume=True).repeated == 16
     assert_same(folder, whole)
 
@@ -137,7 +137,7 @@ def test_parts_without_checksums_are_read_and_kept(half, whole, tmp_path):
     folder = copy(half, tmp_path)
     (folder / SUMS).unlink()
     (finding,) = examine(folder).findings
-    assert (finding.name, finding.what) == (SUMS, "is missing, so that nothing vouches for the other files")
+    assert (finding.name, finding.fault) == (SUMS, "is missing, so that nothing vouches for the other files")
     assert len(results.load_runs(folder)) == RUNS - 8
     resumed = run(folder, resume=True)
     assert (resumed.repeated, resumed.notes) == (8, [])
@@ -184,7 +184,7 @@ def test_a_file_that_lost_its_line_is_vouched_for_again(whole, tmp_path, name):
     folder = copy(whole, tmp_path)
     lines = (folder / SUMS).read_text().splitlines(keepends=True)
     (folder / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
-    named = [(each.name, each.what) for each in examine(folder).findings]
+    named = [(each.name, each.fault) for each in examine(folder).findings]
     assert named == [(name, f"is not listed in {SUMS}")]
     assert run(folder, resume=True).repeated == (0 if name == results.MANIFEST else RUNS)
     assert fault(folder, name, read_sums(folder)) is None
@@ -295,9 +295,9 @@ def test_stray_files_are_named_and_count_for_nothing(half, whole, tmp_path):
     for name in ("1x.runs.parquet", "0.runs.parquet", "notes.txt"):
         shutil.copy(part, folder / results.PARTS / name)
     assert len(results.load_runs(folder)) == RUNS - 8
-    assert {finding.what for finding in examine(folder).findings} == {"is no file of a batch"}
+    assert {finding.fault for finding in examine(folder).findings} == {"is no file of a batch"}
     shutil.copy(part, folder / results.part_name(20, results.RUNS))
-    assert examine(folder).findings[0].what == "is not listed in SHA256SUMS"
+    assert examine(folder).findings[0].fault == "is not listed in SHA256SUMS"
     assert run(folder, resume=True).repeated == 8
     assert_same(folder, whole)
 
@@ -346,7 +346,7 @@ def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_pat
 def test_a_file_that_is_gone_is_named(whole, tmp_path, name):
     folder = copy(whole, tmp_path)
     (folder / name).unlink()
-    found = [(each.name, each.what) for each in examine(folder).findings]
+    found = [(each.name, each.fault) for each in examine(folder).findings]
     assert found == [(name, "is missing")]
 
 
@@ -363,11 +363,11 @@ def test_rows_that_are_not_those_of_their_part_are_named_where_nothing_vouches_f
     if source is None:
         (folder / results.part_name(8, results.RUNS)).unlink()
         rows = [made_up_row(f"run{index}") for index in range(6)]
-        parquet.write_table(parquet.as_table(rows), folder / results.part_name(8, results.RUNS))
-        parquet.write_table(parquet.as_table(rows), place)
+        tables.write_table(tables.as_table(rows), folder / results.part_name(8, results.RUNS))
+        tables.write_table(tables.as_table(rows), place)
     else:
         shutil.copy(folder / results.part_name(source, results.RUNS), place)
-    named = {each.name: each.what for each in examine(folder).findings}
+    named = {each.name: each.fault for each in examine(folder).findings}
     assert named[results.part_name(name, results.RUNS)] == what
 
 
@@ -378,7 +378,7 @@ def test_a_changed_bit_is_found_by_the_pages_where_nothing_vouches_for_a_table(h
     content = bytearray(place.read_bytes())
     content[60] ^= 1  # within the first page
     place.write_bytes(content)
-    named = {each.name: each.what for each in examine(folder).findings}
+    named = {each.name: each.fault for each in examine(folder).findings}
     said = named[results.part_name(8, results.RUNS)]
     assert said.startswith("cannot be read (")
     assert "CRC" in said  # the words of the library

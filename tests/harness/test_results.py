@@ -13,9 +13,7 @@ from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch import results
-from servobench.harness.batch import tables as parquet
-from servobench.harness.batch.checksums import SUMS
+from servobench.harness.batch import results, tables
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.tables import NEEDED
 from servobench.harness.config.settings import ConfigurationError
@@ -24,6 +22,7 @@ from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
+from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.files import point_latest, write_atomically
 
 STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}
@@ -168,7 +167,7 @@ def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(f
 
 
 def test_what_is_no_number_is_null_and_a_column_of_it_one_of_numbers():
-    table = parquet.as_table([{"some": np.nan, "none": np.nan, "nothing": None}, {"some": 2.0, "none": np.nan}])
+    table = tables.as_table([{"some": np.nan, "none": np.nan, "nothing": None}, {"some": 2.0, "none": np.nan}])
     assert [str(each) for each in table.schema.types] == ["double", "double", "null"]
     assert [column.null_count for column in table.columns] == [1, 2, 2]
 
@@ -214,7 +213,7 @@ def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
 
 
 def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, monkeypatch):
-    monkeypatch.setattr(parquet, "ROW_GROUP", 2)
+    monkeypatch.setattr(tables, "ROW_GROUP", 2)
     for index in range(5):
         add_part(folder, index)
     assert results.has_steps(folder)
@@ -282,7 +281,7 @@ def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     lack = "lacks the columns controller, task, mismatch, seed, status"
     with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: it {lack}$"):
         results.load_runs(folder)
-    assert lack in [finding.what for finding in examine(folder).findings]
+    assert lack in [finding.fault for finding in examine(folder).findings]
     pd.DataFrame({"run_id": ["a"], "time_s": [0.0]}).to_parquet(folder / results.STEPS)
     with pytest.raises(ConfigurationError, match="is no table of steps: it lacks the column error_norm$"):
         results.load_steps(folder)

@@ -14,7 +14,8 @@ import pytest
 
 from kit.command import PACKAGE
 from servobench.harness.batch import processes, sandbox
-from servobench.harness.batch.sandbox import Limits, Pool, Task
+from servobench.harness.batch.processes import Limits
+from servobench.harness.batch.sandbox import Pool, Task
 from servobench.harness.config.settings import ConfigurationError
 
 
@@ -36,7 +37,8 @@ def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_woul
 STOPPED = """
 import os, pickle, signal, time
 from servobench.harness.batch import processes
-from servobench.harness.batch.sandbox import Limits, Pool, Task
+from servobench.harness.batch.processes import Limits
+from servobench.harness.batch.sandbox import Pool, Task
 
 def hold(seconds, tell):
     tell(None)

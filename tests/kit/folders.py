@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
-from servobench.harness.batch.checksums import write_vouched
+from servobench.plant.contract.checksums import write_vouched
 
 CONTROLLERS = ("rbfnn_mfac", "ukf_mfac", "someone_elses")
 MANIFEST = {"created": "2026-01-01T00:00:00+00:00", "packages": {"servobench": "0.1.0"}, "python": "3.11.0"}

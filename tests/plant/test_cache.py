@@ -41,10 +41,10 @@ DAMAGES = {
     "flipped": lambda files: (files / "one").write_bytes(b"onE"),
     "cut short": lambda files: (files / "deep" / "two").write_bytes(b""),
     "removed": lambda files: (files / "one").unlink(),
-    "seal cut short": lambda files: (files.parent / "seal.json").write_text('{"one": "7'),
-    "seal empty": lambda files: (files.parent / "seal.json").write_text("{}"),
-    "seal of another kind": lambda files: (files.parent / "seal.json").write_text("[1]"),
-    "no seal": lambda files: (files.parent / "seal.json").unlink(),
+    "checksums cut short": lambda files: (files.parent / "SHA256SUMS").write_text("2c26b46b68ffc6"),
+    "checksums empty": lambda files: (files.parent / "SHA256SUMS").write_text(""),
+    "checksums of another kind": lambda files: (files.parent / "SHA256SUMS").write_text("[1]\n"),
+    "no checksums": lambda files: (files.parent / "SHA256SUMS").unlink(),
 }
 
 

@@ -49,7 +49,7 @@ def refused(path: Path) -> str:
     assert message.startswith(f"fmu file {path}")
     assert "\n" not in message
     left = cache_folder("extracted")
-    assert not left.exists() or all(each.is_file() or (each / "seal.json").is_file() for each in left.iterdir())
+    assert not left.exists() or all(each.is_file() or (each / "SHA256SUMS").is_file() for each in left.iterdir())
     return message
 
 

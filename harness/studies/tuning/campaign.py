@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from servobench.harness.batch.lock import LOCK
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import default_config, file_stem
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.objective import TuningSet, score

@@ -31,7 +31,7 @@ import numpy as np
 
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.lanes import side_by_side_key

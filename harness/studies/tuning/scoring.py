@@ -20,7 +20,7 @@ from typing import Any, Final, TypeAlias, final
 import numpy as np
 
 from servobench.harness.analysis.loops.loop_analysis import delay_margin
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import apply_settings, default_config, file_stem
 from servobench.harness.config.settings import ConfigurationError, flatten
 from servobench.harness.run.experiment import build_once

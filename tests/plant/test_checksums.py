@@ -9,17 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from servobench.harness.batch.checksums import (
-    SUMS,
-    UnwritableFolder,
-    append_sums,
-    fault,
-    keep_sums,
-    read_sums,
-    write_vouched,
-    writing,
-)
+from servobench.harness.batch.tables import UnwritableFolder, sums_of, writing
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.checksums import SUMS, append_sums, fault, keep_sums, read_sums, write_vouched
 
 DIGESTS = "a" * 64, "b" * 64, "c" * 64
 
@@ -115,7 +107,7 @@ def test_a_folder_in_the_place_of_a_file_is_named(tmp_path):
     assert fault(tmp_path, "runs.parquet", {}) == "cannot be read: Is a directory"
     (tmp_path / SUMS).mkdir()
     with pytest.raises(ConfigurationError, match=f"{SUMS} cannot be read: Is a directory"):
-        read_sums(tmp_path)
+        sums_of(tmp_path)
 
 
 def test_a_folder_that_takes_no_more_files_says_why_once(tmp_path):

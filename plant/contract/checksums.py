@@ -1,70 +1,35 @@
-"""What vouches for the files of a results folder: `SHA256SUMS`, a line a file, as `sha256sum --check` reads it.
+"""Checksums of the files of a folder: `SHA256SUMS`, a line a file, as `sha256sum --check` reads it.
 
-While a batch is under way the file only grows. A line is on the disk before the file that it is about has its name, so
-that a file without a line was never written by a batch, and one with another content than its line says was changed
-since. A line of a file that is not there says nothing: the process was killed in between.
+Results folders and entries of the cache have one. It only grows while files are written: a line is on the disk before
+its file has its name, so that a file without a line was never written here, and a file with another content than its
+lines say was changed since. A line without a file says nothing: the process was killed in between.
 """
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.files import partial_path, sync, write_atomically
 
 SUMS: Final = "SHA256SUMS"
-LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>[^\s/]+(/[^\s/]+)?)")
+LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>\S.*)")
 TABLE_END: Final = b"PAR1"  # the last bytes of a Parquet file
 
 Sums = Mapping[str, frozenset[str]]  # the digests that a file may have, by its name within the folder
 
 
-class DamagedFile(ConfigurationError):
-    """A file of a results folder is not what was written."""
-
-    def __init__(self, folder: Path, name: str, what: str) -> None:
-        """Say what is wrong, and what to type."""
-        self.what = what
-        remedy = f"repeat the command that made the folder with --resume, or type: servobench verify {folder}"
-        super().__init__(f"{folder / name} {what}; {remedy}")
-
-
-class UnwritableFolder(OSError):
-    """The results folder takes no more files."""
-
-
-@contextlib.contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Name the results folder where the system refuses to write.
-
-    Raises:
-        UnwritableFolder: it did.
-    """
-    try:
-        yield
-    except UnwritableFolder:
-        raise
-    except OSError as error:
-        why = error.strerror or str(error) or type(error).__name__
-        if error.errno == errno.ENOENT and not folder.is_dir():
-            why = "it was removed"
-        raise UnwritableFolder(error.errno, f"results folder {folder} cannot be written: {why}") from error
-
-
 def write_vouched(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> None:
-    """Write files of a results folder that belong together, and their lines before they have their names.
+    """Write files that belong together, and their lines before they have their names.
 
     Args:
-        folder: a results folder.
-        files: by name within the folder, what writes the content to a path; they get their names in this order.
+        folder: of the files.
+        files: by name within the folder, a function that writes the content to a path; they are named in this order.
     """
     partials = {name: partial_path(folder / name) for name in files}
     try:
@@ -82,7 +47,7 @@ def write_vouched(folder: Path, files: Mapping[str, Callable[[Path], object]]) -
 
 
 def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
-    """Write lines to the end; what a killed process left of one becomes a line that is not read."""
+    """Write lines to the end; the beginning of one that a killed process left becomes a line that is not read."""
     lines = "".join(f"{each}  {name}\n" for name, each in digests.items()).encode()
     created = not (folder / SUMS).exists()
     with (folder / SUMS).open("a+b") as file:
@@ -104,19 +69,22 @@ def keep_sums(folder: Path, sums: Sums, names: Collection[str]) -> None:
 
 
 def read_sums(folder: Path) -> Sums | None:
-    """Return the lines of a folder; None where it has no such file, as one of an earlier version.
+    """Return the lines of a folder, which are read once; None where it has no such file.
 
     Raises:
-        ConfigurationError: the file cannot be read.
+        OSError: the file cannot be read.
     """
+    path = folder / SUMS
     try:
-        text = (folder / SUMS).read_text(encoding="utf-8", errors="replace")
+        return _read_sums(path, *_version(path))
     except FileNotFoundError:
         return None
-    except OSError as error:
-        raise ConfigurationError(f"{folder / SUMS} cannot be read: {error.strerror}") from error
+
+
+@lru_cache(maxsize=8)
+def _read_sums(path: Path, *_version: int) -> Sums:
     found: dict[str, frozenset[str]] = {}
-    for line in text.split("\n")[:-1]:
+    for line in path.read_text(encoding="utf-8", errors="replace").split("\n")[:-1]:
         match = LINE.fullmatch(line)
         if match:
             found[match["name"]] = found.get(match["name"], frozenset()) | {match["digest"]}
@@ -124,10 +92,10 @@ def read_sums(folder: Path) -> Sums | None:
 
 
 def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
-    """Return what is wrong with a file, as a predicate; None if it is what was written.
+    """Return the fault of a file, as a predicate; None if it has the content that was written.
 
     Args:
-        folder: a results folder.
+        folder: of the file.
         name: of the file within the folder.
         sums: the folder's lines; None: there are none, and only an empty or missing file is wrong.
     """
@@ -151,15 +119,20 @@ def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file; of one that has not changed since, it is known."""
-    stat = path.stat()
-    return _digest(path, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size, stat.st_ino)
+    """Return the SHA-256 of a file, which is read once while it does not change."""
+    return _digest(path, *_version(path))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=4096)
 def _digest(path: Path, *_version: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _version(path: Path) -> tuple[int, int, int, int]:
+    """Return numbers that differ once a file was written again."""
+    stat = path.stat()
+    return stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size, stat.st_ino
 
 
 def _end(path: Path) -> bytes:
