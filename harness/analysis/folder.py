@@ -1,4 +1,4 @@
-"""Describes a results folder in words, and reads its tables beside the runs and steps."""
+"""Describes a results folder in words, and reads its further tables."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
 
 
 def describe_settings(folder: Path) -> dict[str, str]:
-    """Return every setting of the runs by section and name; empty where the folder does not tell them.
+    """Return every setting of the runs by section and name; empty where the folder has none.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -63,7 +63,7 @@ def describe_settings(folder: Path) -> dict[str, str]:
 
 
 def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield name and content of each table beside the runs and steps of a folder, such as answered claims.
+    """Yield name and content of each further table of a folder, without runs and steps, such as answered claims.
 
     Raises:
         ConfigurationError: one of them cannot be read.

@@ -1,6 +1,6 @@
-"""The result of a results folder in a sentence or two, and who came first in each place.
+"""The result of a results folder in a sentence or two, and the leading controller in each place.
 
-Two controllers are told apart where a paired signed-rank test over seeds, corrected for all pairs after Holm, stays
+Two controllers count as different where a paired signed-rank test over seeds, corrected for all pairs after Holm, stays
 below 5 %. A seed counts once, however many tasks it was run on: runs of one seed share a robot. Controllers that know
 the true robot are bounds and are not ranked.
 """
@@ -31,12 +31,12 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
-LEVEL: Final = 0.05  # of the test by which two controllers are told apart
+LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
 BETTER: Final = "faster or more precise"
 NAMED: Final = 3  # controllers that a sentence names
-MOST_PLACES: Final = 24  # of which it is said who came first
+MOST_PLACES: Final = 24  # for which leaders are named
 
 Place = tuple[str, pd.DataFrame]  # words, runs
 
@@ -80,7 +80,7 @@ def ranked_controllers(runs: pd.DataFrame) -> list[str]:
 
 
 def knows_truth(name: str) -> bool:
-    """Return whether a controller of this package needs the true robot; a third party's is not loaded to ask."""
+    """Return whether a controller of this package needs the true robot; a third party's is not loaded for this."""
     if name not in CONTROLLERS and "+" not in name:
         return False
     try:
@@ -98,7 +98,7 @@ def asked_of(runs: pd.DataFrame) -> str:
 
 
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return who came first in each plant, task and condition, and how sure that is; empty without a competition.
+    """Return the leading controller of each plant, task and condition with its evidence; empty without a competition.
 
     First is the controller with the highest success rate, then the one that has the smallest median settling time, on
     a curve the smallest median error.
@@ -111,7 +111,7 @@ def leaders(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def seeds_needed(controllers: int) -> int:
-    """Return how many seeds the test needs at least until it can tell two of so many controllers apart."""
+    """Return the least number of seeds with which the test can distinguish two of so many controllers."""
     pairs = controllers * (controllers - 1) // 2
     return 1 + int(np.ceil(np.log2(pairs / LEVEL)))
 

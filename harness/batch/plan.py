@@ -64,7 +64,7 @@ def parse_seeds(text: str) -> Sequence[int]:
     """Return the seeds that `text` names: a count `5`, a list `3,1,4`, or a range `100:120` (end not included).
 
     Raises:
-        ConfigurationError: none of these, or empty.
+        ConfigurationError: none of these, or seeds that a batch cannot have.
     """
     came = f"got {shorten(repr(text), MAX_SHOWN, placeholder=' ...')}"
     try:
@@ -77,6 +77,19 @@ def parse_seeds(text: str) -> Sequence[int]:
             seeds = range(max(0, int(text)))
     except ValueError as error:
         raise ConfigurationError(f"seeds must be a count (5), a list (3,1,4) or a range (100:120), {came}") from error
+    return check_seeds(seeds, came)
+
+
+def check_seeds(seeds: Sequence[int], came: str) -> Sequence[int]:
+    """Return seeds that a batch can have.
+
+    Args:
+        seeds: to check.
+        came: end of the message, with the text that named them.
+
+    Raises:
+        ConfigurationError: none, too many, one negative, too large or named twice.
+    """
     if isinstance(seeds, range):
         first, last = seeds.start, seeds.stop - 1
     else:

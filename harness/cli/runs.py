@@ -79,7 +79,7 @@ def run(
     The exit code is 1 if the run failed.
     """
     from servobench.harness.batch.campaign import Execution, comparison
-    from servobench.harness.batch.plan import Batch, parse_seeds
+    from servobench.harness.batch.plan import Batch, check_seeds
     from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
@@ -89,7 +89,7 @@ def run(
         refuse(f"--view shows the plant bullet only, got --plant {plant}")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.known_controller(law if estimator is None else f"{law}+{estimator}")
-    seeds = parse_seeds(f"{seed},")
+    seeds = check_seeds((seed,), f"got {seed}")
     batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)

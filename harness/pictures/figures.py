@@ -12,7 +12,6 @@ from typing import NamedTuple, TypeVar
 import pandas as pd
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import with_places
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES, draw_measures, draw_step_times
 from servobench.harness.pictures.paths import draw_paths
@@ -38,9 +37,7 @@ from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles,
 
 FOLDER = "figures"
 LETTERS = 15.0  # of a title in an inch
-MOVES_A_FIGURE = 4
-TASKS_A_FIGURE = 4
-BLOCKS_A_FIGURE = 4
+TASKS_A_FIGURE = 4  # also blocks of paths
 HEADINGS = {
     "errors": "Error of moves over time",
     "features": "Measured features of moves",
@@ -86,10 +83,8 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    for place, plan in _plans(
-        folder, results.load_runs(folder), moves=MOVES_A_FIGURE, tasks=TASKS_A_FIGURE, blocks=BLOCKS_A_FIGURE
-    ):
-        if (named := _carry_out(place, plan, WIDE)) is not None:
+    for group, plan in _plans(folder, results.load_runs(folder), TASKS_A_FIGURE):
+        if (named := _carry_out(group, plan, WIDE)) is not None:
             yield named
 
 
@@ -104,9 +99,9 @@ def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> It
     Raises:
         ConfigurationError: not a results folder.
     """
-    for place, plan in _plans(folder, runs, moves=1, tasks=1, blocks=1):
+    for group, plan in _plans(folder, runs, 1):
         if plan.kind in kinds:
-            wide, narrow = (_carry_out(place, plan, layout) for layout in (WIDE, NARROW))
+            wide, narrow = (_carry_out(group, plan, layout) for layout in (WIDE, NARROW))
             if wide is not None and narrow is not None:
                 yield wide, narrow
 
@@ -120,46 +115,37 @@ class _Plan(NamedTuple):
     draw: Callable[[Layout], Figure | None]
 
 
-class _Place(NamedTuple):
-    """Where the runs of a figure were made."""
-
-    group: Group
-    runs: pd.DataFrame
-
-
-def _plans(folder: Path, runs: pd.DataFrame, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
-    """Yield the figures of a folder, which at most so many moves, tasks and blocks of paths share."""
-    runs = with_places(runs)
+def _plans(folder: Path, runs: pd.DataFrame, size: int) -> Iterator[tuple[Group, _Plan]]:
+    """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
     styles = method_styles(runs["controller"].tolist())
     for group in load_groups(folder, runs):
-        chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
-        ensembles = load_ensembles(folder, chosen)
+        ensembles = load_ensembles(folder, group.runs)
         for plan in (
-            *_move_plans(group, ensembles, styles, moves, blocks),
+            *_move_plans(group, ensembles, styles, size),
             *_curve_plans(group, ensembles, styles),
-            *_cost_plans(group, chosen, ensembles, styles, tasks),
+            *_cost_plans(group, ensembles, styles, size),
         ):
-            yield _Place(group, chosen), plan
+            yield group, plan
 
 
-def _carry_out(place: _Place, plan: _Plan, layout: Layout) -> NamedFigure | None:
+def _carry_out(group: Group, plan: _Plan, layout: Layout) -> NamedFigure | None:
     """Return a figure with its name and heading."""
     with figure_style(TEXT):
         figure = plan.draw(layout)
     if figure is None:
         return None
-    kind, part, plant, mismatch = plan.kind, plan.part, place.group.plant, place.group.mismatch
-    details = ", ".join(filter(None, (part, f"{plant}, mismatch {mismatch}", _sample(kind, place.group, place.runs))))
+    heading, place = HEADINGS[plan.kind], f"{group.plant}, mismatch {group.mismatch}"
+    details = ", ".join(filter(None, (plan.part, place, _sample(plan.kind, group))))
     wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
-    figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
-    words = "_".join(word for word in (kind, part, plant, mismatch) if word)
+    figure.suptitle(f"{heading}\n{wrapped}", fontsize=TEXT + 1.0)
+    words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
     stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
-    return NamedFigure(kind, stem, f"{HEADINGS[kind]}: {details}", plan.tasks, figure)
+    return NamedFigure(plan.kind, stem, f"{heading}: {details}", plan.tasks, figure)
 
 
-def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
+def _sample(kind: str, group: Group) -> str:
     """Return words for the seeds that a figure shows, and how."""
-    seeds = runs["seed"].nunique()
+    seeds = group.runs["seed"].nunique()
     if kind in OF_FIRST_SEED or seeds == 1:
         return f"seed {group.seed}"
     if kind not in OVER_SEEDS:
@@ -168,9 +154,7 @@ def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
     return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
 
 
-def _move_plans(
-    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int, blocks: int
-) -> Iterator[_Plan]:
+def _move_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
     moves = group.select(point_to_point=True)
     for words, part in _parts(moves, size):
         own = {task: ensembles[task] for task in part}
@@ -178,7 +162,7 @@ def _move_plans(
         yield _Plan("errors", words, tuple(part), partial(draw_moves, own, styles))
         yield _Plan("features", words, tuple(part), partial(draw_features, part, until, styles))
     heads = divisions(name for tracks in moves.values() for name in tracks)
-    for words, part in _parts(moves, max(1, blocks // len(heads))):
+    for words, part in _parts(moves, max(1, size // len(heads))):
         yield _Plan("paths", words, tuple(part), partial(draw_paths, part, styles))
 
 
@@ -188,9 +172,8 @@ def _curve_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Style
         yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
 
 
-def _cost_plans(
-    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
-) -> Iterator[_Plan]:
+def _cost_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
+    runs = group.runs
     everything = tuple(group.tasks)
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all

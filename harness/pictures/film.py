@@ -45,7 +45,7 @@ FINENESS = 1.25  # pixels rendered for one pixel of the overview, along each sid
 REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
 SNAPSHOT_COUNT = 8
 MIN_ADVANCE = 0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
-CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: it is seen around the ball
+CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: larger than the ball
 CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
 GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
 QUALITY = "22"  # of H.264: smaller is better and larger
@@ -65,7 +65,7 @@ def find_kind(name: str) -> str:
 
 
 def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:
-    """Write the recordings of a run that are named in `kinds`, beside each other, and return the files.
+    """Write the recordings of a run that are named in `kinds` into one folder, and return the files.
 
     Args:
         run: a logged run.
@@ -165,18 +165,7 @@ def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Ite
 
 def _options(kind: str, rate: float) -> list[str]:
     if kind == MP4:
-        return [
-            "-c:v",
-            "libx264",
-            "-pix_fmt",
-            "yuv420p",
-            "-crf",
-            QUALITY,
-            "-preset",
-            "medium",
-            "-movflags",
-            "+faststart",
-        ]
+        return f"-c:v libx264 -pix_fmt yuv420p -crf {QUALITY} -preset medium -movflags +faststart".split()
     # One palette for the whole film, no dithering, and only the rectangle that changed: a still background is free.
     chain = (
         f"fps={min(float(GIF_RATE), rate):g},scale={GIF_WIDTH}:-1:flags=area,split[a][b];"

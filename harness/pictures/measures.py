@@ -39,9 +39,9 @@ PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
 MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
-NAME_LETTERS: Final = 20  # of a controller's name in a line beside an axis, for each column of a layout
+NAME_LETTERS: Final = 20  # of a controller's name at an axis, for each column of a layout
 LETTERS: Final = 16.0  # of a label in an inch
-NUMBERS: Final = 0.25  # [in] beside the names
+NUMBERS: Final = 0.25  # [in] next to the names
 LEAST_ROWS: Final = 4  # controllers for which a panel has room
 SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
 UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
@@ -62,7 +62,7 @@ class _Dots(NamedTuple):
 def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
-    The metrics of a single task are beside each other, on a narrow sheet below each other.
+    The metrics of a single task stand in one row, on a narrow sheet in one column.
 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
 
@@ -108,23 +108,18 @@ def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -
 
 
 def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
-    """Draw measures of one task beside each other, as many as the layout has columns."""
+    """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
     rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
-    columns = min(layout.columns, len(rows))
-    lines = -(-len(rows) // columns)
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
-    letters = round((layout.width - beside) / columns / LETTER)
+    letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
     words = [textwrap.fill(row.label, letters) for row in rows]
     height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
-    figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
-    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
-    for axes, row, label in zip(panels, rows, words, strict=False):
+    figure, panels = panel_grid(len(rows), height, layout, head=0.35)
+    for axes, row, label in zip(panels, rows, words, strict=True):
         _draw_dots(axes, runs, names, styles, row)
         _name_rows(axes, names, layout)
         axes.set_xlabel(label)
-    for axes in panels[len(rows) :]:
-        axes.set_visible(False)
     return figure
 
 
@@ -274,7 +269,7 @@ def draw_places(
     values: Mapping[str, Sequence[Estimate]],
     styles: Mapping[str, MethodStyle],
 ) -> None:
-    """Draw an estimate with its interval for each method at each place; the methods stand beside each other.
+    """Draw an estimate with its interval for each method at each place; the marks of the methods are shifted sideways.
 
     Args:
         axes: where.

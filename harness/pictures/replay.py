@@ -1,4 +1,4 @@
-"""A logged run shown again: the rendered arm at its joint positions, seen from outside and by its own camera.
+"""Replay of a logged run: the rendered arm at its joint positions, from outside and in its own camera.
 
 The true robot is sampled again from the run's mismatch and seed and compared with the values in the table. Nothing is
 simulated: each frame has the logged joint positions, and the ball is detected in an image without noise.
@@ -32,7 +32,7 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot
 
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
-SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
+SEEN_DEPTH = 0.05  # [m] behind a surface at which a trail still counts as in front: it begins within the ball
 ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
 HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
 
@@ -228,7 +228,7 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
 
 
 def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:
-    """Return the first period in which the true feature (k, m) is the one that the moved camera sees at q (k, n)."""
+    """Return the first period in which the true feature (k, m) is that of the moved camera at q (k, n)."""
     before, after = (
         np.linalg.norm([camera.feature(joints) - seen for joints, seen in zip(q, feature, strict=True)], axis=1)
         for camera in (model, moved)

@@ -66,11 +66,11 @@ JOINTS: Final = (
     (PURPLE, (0, (2, 1))),
     (SKY, "-"),
     (BLACK, ":"),
-)  # looks of joints in their order
+)  # colours and lines of joints in their order
 ROW: Final = 0.72  # [in] a controller
 QUANTITIES: Final = ("joint speed [rad/s]", "acceleration [rad/s²]", "jerk [rad/s³]")
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
-FLOOR: Final = 0.1  # settling bands: the least error that is told apart over time
+FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
 OUTSIDE: Final = 1e12  # of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 
@@ -78,7 +78,8 @@ MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure:
     """Draw the error of each task over time: median and band over seeds, and where runs settled (figure 4).
 
-    With aids and as published are beside each other where there are both. The time ends when methods have settled.
+    Methods with aids and as published have panels of their own where there are both. The time ends when methods have
+    settled.
     """
     figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
     low, high = error_limits([ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
@@ -220,7 +221,7 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
 def error_limits(ensembles: Collection[Ensemble]) -> tuple[float, float]:
     """Return between which errors these runs are shown [error unit]; 0 where that is not known.
 
-    Errors of a small part of the settling band are left out: there is noise, and a median tells it better.
+    Errors of a small part of the settling band are left out: they are noise, which a median describes better.
     """
     largest = [float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0)) for ensemble in ensembles]
     band = next(iter(ensembles)).settling_band
@@ -284,7 +285,7 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
 
 
 def mark_settling_band(axes: Axes, runs: Track | Ensemble) -> None:
-    """Draw the error within which a run counts as settled, where the table of runs tells it."""
+    """Draw the error within which a run counts as settled, where the table of runs has it."""
     if math.isfinite(runs.settling_band):
         label = f"settling band, {runs.settling_band:g} {runs.error_unit[0]}"
         axes.axhline(runs.settling_band, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=label)

@@ -51,10 +51,10 @@ class Sheet(NamedTuple):
     """A table."""
 
     groups: list[tuple[str, int]]  # title and number of columns of each group of columns; empty without groups
-    headings: list[tuple[str, str]]  # of each column, with its unit apart
+    headings: list[tuple[str, str]]  # of each column: name, unit
     rows: list[SheetRow]
     size: str  # `few`, `some` or `many` columns, for the width at which rows become cards
-    pairs: bool  # whether every group has two columns, which stay beside each other in a card
+    pairs: bool  # whether every group has two columns, which stay side by side in a card
 
 
 def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:

@@ -28,7 +28,7 @@ SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
 WINE, INDIGO = "#882255", "#332288"  # of Tol's palette, which goes with it
 MARKS = 8  # on each line
 WIDTH = 7.2  # [in] of a figure: both columns of a paper
-MOST_LINES = 7  # of methods in a panel, besides those that know the true robot
+MOST_LINES = 7  # of methods in a panel, not counting those that know the true robot
 TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
@@ -39,8 +39,8 @@ ENDED, END = "run ended early", "|"  # and its marker, which no method has
 SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
 NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
 FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
-LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of the line beside it
-MARGIN: Final = 0.2  # [in] beside the legend
+LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of its sample line
+MARGIN: Final = 0.2  # [in] on both sides of the legend
 DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
 END_MARK: dict[str, Any] = {"marker": END, "markersize": 12, "markeredgewidth": 2.0, "linestyle": "", "zorder": 12,
                             "gid": ENDED}  # fmt: skip
@@ -81,7 +81,7 @@ NARROW = Layout(2.75, 1, 335, 2.0)  # of a phone of 390 px, with a bar to scroll
 
 @dataclass(frozen=True)
 class MethodStyle:
-    """How a method's line looks.
+    """Colour, line and marker of a method.
 
     Attributes:
         colour: as matplotlib and browsers take it.
@@ -147,7 +147,7 @@ _STYLES |= {
 def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
     """Return a style for each name: the known ones always the same, others by their place in the alphabet.
 
-    Ask once for all names of a folder, so that a third party's controller looks the same in all its figures.
+    Call it once for all names of a folder, so that a third party's controller has one style in all its figures.
     """
     wanted = list(dict.fromkeys(names))
     unknown = sorted(name for name in wanted if name not in _STYLES)
@@ -197,17 +197,18 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
     )
 
 
-def panel_grid(count: int, height: float, layout: Layout = WIDE) -> tuple[Figure, list[Axes]]:
+def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1.0) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels with a common ordinate, and its `count` panels.
 
     Args:
         count: how many panels, at least one.
-        height: of a row, inches.
+        height: of a row [in].
         layout: of the figure.
+        head: height of the title and the legend [in].
     """
     columns = min(layout.columns, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(layout.width, 1.0 + height * rows), layout="constrained")
+    figure = Figure(figsize=(layout.width, head + height * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)
@@ -256,7 +257,7 @@ def plain_logarithms(axes: Axes) -> None:
 
 
 def save_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PNG and as PDF beside each other; the same figure gives the same bytes."""
+    """Write a figure as PNG and PDF with the same name; the same figure gives the same bytes."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths = []
     for ending in FORMATS:

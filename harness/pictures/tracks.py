@@ -78,7 +78,7 @@ class Track:
 
     @property
     def settling_band(self) -> float:
-        """The error within which the run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        """The error within which the run counts as settled [`error_unit`]; NaN if the table has none."""
         return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
 
     @property
@@ -129,12 +129,14 @@ class Group:
     Attributes:
         plant: its name.
         mismatch: as it was given.
-        seed: of these runs.
+        runs: all runs of this plant and mismatch.
+        seed: of the runs in `tasks`.
         tasks: task -> controller -> track; tasks without any step are left out.
     """
 
     plant: str
     mismatch: str
+    runs: pd.DataFrame
     seed: int
     tasks: dict[str, Tracks]
 
@@ -169,7 +171,7 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
             if row["run_id"] in tables:
                 table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
                 tasks.setdefault(row["task"], {})[row["controller"]] = Track({str(k): row[k] for k in row}, table)
-        yield Group(str(plant), str(mismatch), int(chosen["seed"].iloc[0]), tasks)
+        yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
 
 
 def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
@@ -226,7 +228,7 @@ class Ensemble:
 
     @property
     def settling_band(self) -> float:
-        """The error within which a run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
         return self.error_unit[1] * float(self.runs.reindex(columns=["settling_band"])["settling_band"].iloc[0])
 
     @property

@@ -19,8 +19,7 @@ from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, 
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import judge_run
-from servobench.harness.run.outcome import find_outcome
-from servobench.harness.run.pose_error import final_pose_error, pose_errors
+from servobench.harness.run.outcome import final_pose_error, find_outcome, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect

@@ -80,7 +80,7 @@ class Metric:
         label: its name in tables and figures.
         digits: behind the decimal point where it is shown.
         meaning: its definition.
-        values: of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.pose_error`.
+        values: of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.outcome`.
         percent: whether it is shown in percent.
         better: `less`, or empty where neither direction is better.
         tables: the tables of the report that show it, each with the group of columns: moves, curves, cost, runs.

@@ -1,4 +1,4 @@
-"""The outcome of a run in one word; `status` says how it ended.
+"""The outcome of a run in one word, and the pose error of its target; `status` says how the run ended.
 
 | outcome | of | meaning |
 |---|---|---|
@@ -20,10 +20,15 @@ import math
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from servobench.harness.run.log import Steps
+from servobench.harness.run.metrics import FINAL_SPAN
+from servobench.harness.run.references import ImageReference, Reference
 from servobench.harness.run.scenario import Scenario
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.inverse import closest_distance
 
@@ -31,8 +36,7 @@ SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
 TARGET_UNREACHABLE, JOINT_AT_LIMIT = "target_unreachable", "joint_at_limit"
 ACHIEVED: Final = (SETTLED, FOLLOWED)
-OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)  # beside the faults
-
+OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)  # without the faults
 FOLLOWING_BANDS: Final = 2.0  # settling bands: an RMS error of 10 mm on the UR5
 AT_STOP: Final = 1e-6  # [rad] from a joint's stop
 HELD: Final = 1.0  # [s] at a stop
@@ -50,7 +54,7 @@ def find_outcome(
         settling_time: [s]; NaN if it never settled.
         rms_error_evaluated: of the judged part [unit of the feature].
         robot: the true arm with the camera as it is at the end of the run; None if only the plant knows it. Reach is
-            looked at where the features are places.
+            checked only where the features are positions.
     """
     move = scenario.kind == "point_to_point"
     band = (1.0 if move else FOLLOWING_BANDS) * steps.spec.feature.band
@@ -78,3 +82,45 @@ def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, ba
     points: FloatArray = np.unique(judged[:: max(1, len(judged) // CURVE_POINTS)], axis=0)
     spec = steps.spec
     return bool((closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper) > band).any())
+
+
+def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
+    """Return distance (k,) [mm] and angle (k,) [deg] of the target from its reference pose; None where not judged.
+
+    Where the camera is moved during the run, the target is still judged by its taught pose.
+    """
+    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, ImageReference)):
+        return None
+    distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
+    return 1e3 * distance, np.degrees(angle)
+
+
+def final_pose_error(distance: FloatArray, angle: FloatArray, period: float) -> dict[str, float]:
+    """Return the means of the last second as columns of the table of runs.
+
+    Args:
+        distance: (k,) [mm].
+        angle: (k,) [deg].
+        period: of control [s].
+    """
+    rows = max(1, round(FINAL_SPAN / period))
+    return {"pose_error_mm": float(distance[-rows:].mean()), "pose_error_deg": float(angle[-rows:].mean())}
+
+
+def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance and angle of a rigid target from its reference pose.
+
+    Args:
+        points: (..., p, 3), at least three points that are not on a line [m].
+        wanted: (..., p, 3) [m].
+
+    Returns:
+        Distance of the means, (...) [m], and the angle of the rotation between the two, (...) [rad], by the singular
+        value decomposition of their correlation (Kabsch).
+    """
+    middle, goal = points.mean(axis=-2), wanted.mean(axis=-2)
+    correlation = (points - middle[..., None, :]).mT @ (wanted - goal[..., None, :])
+    left, _, right = np.linalg.svd(correlation)
+    left[..., -1] *= np.linalg.det(left @ right)[..., None]
+    rotation = Rotation.from_matrix((left @ right).reshape(-1, 3, 3))
+    return norm(middle - goal), rotation.magnitude().reshape(middle.shape[:-1])

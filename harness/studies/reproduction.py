@@ -147,7 +147,7 @@ def read_answers(path: Path) -> Answers:
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
-    """Return a line for each answer that is not the one wanted.
+    """Return a line for each answer that differs from the stored one.
 
     Verdicts and words must be the same. Numbers of the evidence may differ by a tenth and a period: networks that are
     fitted on another processor differ by rounding, which loops amplify.
@@ -179,7 +179,7 @@ def markdown_table(answers: Sequence[Answer]) -> str:
 
 
 def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
-    """Return a remark about the plants on which the same claim came out otherwise; empty if there is none.
+    """Return a remark about the plants with another verdict on the same claim; empty if there is none.
 
     In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
     """

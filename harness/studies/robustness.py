@@ -16,7 +16,6 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import settled_share, settling_band, settling_times
 from servobench.harness.analysis.loops.loop_analysis import latency_border
@@ -29,7 +28,16 @@ from servobench.harness.config.registry import RENDERED, find_controller, find_p
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.pictures.style import TEXT, WIDTH, Styles, add_legend, figure_style, method_styles, save_figure
+from servobench.harness.pictures.style import (
+    TEXT,
+    Styles,
+    add_legend,
+    figure_style,
+    label_rows,
+    method_styles,
+    panel_grid,
+    save_figure,
+)
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -44,7 +52,6 @@ STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it
 MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
 FIGURES: Final = "figures"
 LIMITS: Final = "predicted_limits.csv"
-COLUMNS: Final = 3  # panels of a picture
 NOTE: Final = 115  # letters of a line below it
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"
@@ -277,20 +284,14 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
     ]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with figure_style(TEXT):
-        columns = min(COLUMNS, len(lines))
-        rows = -(-len(lines) // columns)
-        figure = Figure(figsize=(WIDTH, 1.5 + 1.9 * rows), layout="constrained")
-        grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-        for axes, line in zip(grid.flat, lines, strict=False):
+        figure, panels = panel_grid(len(lines), 1.9, head=1.5)
+        for axes, line in zip(panels, lines, strict=True):
             draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, scale.top)
             axes.set_xticks([place.number for place in line.places])
             axes.set_xlabel(line.title)
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
-        for axes in grid[:, 0]:
-            axes.set_ylabel(scale.label)
-        for axes in grid.flat[len(lines) :]:
-            axes.set_axis_off()
+        label_rows(panels, scale.label)
         arm = runs["robot"].iloc[0] if "robot" in runs else DEFAULT_ROBOT  # folders of 0.1.0 have no such column
         which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
         notes = [f"{robots} {which}, bands are 95 % intervals"]
@@ -300,7 +301,7 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
             notes.append("carets at the upper edge: half of the runs or more never settle")
         words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
         figure.suptitle(f"{title}\n{words}", fontsize=TEXT + 0.5)
-        add_legend(figure, grid.flat)
+        add_legend(figure, panels)
     return save_figure(figure, stem)
 
 

@@ -38,7 +38,7 @@ from servobench.plant.robot.robot import Robot
 
 MAX_TILT = radians(45.0)
 MAX_MOVE_TILT = radians(30.0)
-MAX_MAGNITUDES = 10_000  # of a range
+MAX_MAGNITUDES = 10_000  # largest number of magnitudes in a range
 
 
 def _unknown_word(text: str, word: str) -> ValueError:
@@ -173,7 +173,7 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         raise ValueError(f"the range {text!r} of {axis} is empty")
     magnitudes = tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
     for magnitude in magnitudes:
-        Mismatch("", ((axis, magnitude),))  # which refuses one that is out of bounds
+        Mismatch("", ((axis, magnitude),))  # refuses a magnitude that is out of bounds
     return magnitudes
 
 

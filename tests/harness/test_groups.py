@@ -10,6 +10,8 @@ from kit.folders import comparison, failed_only, made_up_row, sweep
 from servobench.harness.analysis import groups
 from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.batch import results
+from servobench.harness.pictures.measures import FIGURES
+from servobench.harness.run.metrics import METRICS
 
 
 def moves(*times: float, **values: object) -> pd.DataFrame:
@@ -138,3 +140,9 @@ def test_settings_are_told_in_words(tmp_path):
     assert describe_settings(folder) == {
         "law.limit": "no limit", "law.gain": "0.5", "law.view": "no", "law.bounds": "1, not set",
     }  # fmt: skip
+
+
+def test_every_place_that_a_metric_names_exists():
+    for metric in METRICS.values():
+        assert all(group in groups.GROUPS[table] for table, group in metric.tables.items()), metric.column
+        assert metric.figure in ("", *FIGURES), metric.column

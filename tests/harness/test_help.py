@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from typing import Annotated
 
 import pytest
 import typer.main
+from typer.testing import CliRunner
 
 from kit.command import servobench
 from servobench.harness.cli.main import PANELS, app, command_line
+from servobench.harness.cli.options import ABSENT, Value, command, option
 
 ROOT = command_line()
 COMMANDS = [
@@ -63,8 +66,8 @@ def test_no_word_in_brackets_is_taken_for_markup(monkeypatch, capsys):
     written = typer.main.get_command(app).commands
     for name in PANELS["First steps"] + PANELS["Studies"]:
         text = wide(monkeypatch, capsys, name.__name__, "--help")
-        for option in written[name.__name__].params:
-            for words in re.findall(r"\[.*?\]", option.help or ""):
+        for each in written[name.__name__].params:
+            for words in re.findall(r"\[.*?\]", each.help or ""):
                 assert words in text
 
 
@@ -98,3 +101,22 @@ def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
     monkeypatch.setattr("servobench.harness.batch.results.check_folder", interrupt)
     assert servobench(monkeypatch, "collect", ".") == 130
     assert capsys.readouterr().err == "servobench: interrupted\n"
+
+
+COLOUR = Value("COLOUR", lambda incomplete: [incomplete + "ed"], lambda text: 2 * text)
+
+
+def paint(*, shade: Annotated[str, option("--colour", COLOUR, "Shade of it.", {"wash": "no paint"})] = "blue"):
+    typer.echo(shade)
+
+
+def test_one_row_declares_name_help_completion_check_and_absence_of_an_option():
+    one = typer.Typer()
+    one.command()(command(paint))
+    run = CliRunner().invoke
+    assert run(one, ["--colour", "red"]).output == "redred\n"
+    assert run(one, []).output == "blueblue\n"
+    assert re.search(r"--colour +COLOUR +Shade of it\.", run(one, ["--help"]).output)
+    (declared,) = (each for each in typer.main.get_command(one).params if each.name == "shade")
+    assert [each.value for each in declared.shell_complete(None, "r")] == ["red"]
+    assert ABSENT["wash", "--colour"] == "no paint"

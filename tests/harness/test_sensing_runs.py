@@ -21,7 +21,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
-from servobench.harness.run.pose_error import pose_error
+from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.references import View
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve

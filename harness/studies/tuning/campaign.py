@@ -125,7 +125,7 @@ class Method:
 
     @property
     def done(self) -> int:
-        """Number of points asked for, as if every finished study had used its whole budget."""
+        """Number of requested points, as if every finished study had used its whole budget."""
         whole = self._plan.trials + self._plan.search
         return sum(each.asked if each.outcome is None else whole for each in self.studies)
 

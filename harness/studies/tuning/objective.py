@@ -114,7 +114,7 @@ class TuningSet:
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
     def second(self) -> TuningSet:
-        """Return the second, larger set: other robots of the tuning range, which no trial sees."""
+        """Return the second, larger set: other robots of the tuning range, which no trial uses."""
         return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
 
     def runs(self) -> list[TuningRun]:

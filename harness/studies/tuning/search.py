@@ -46,7 +46,7 @@ class Found:
 
     values: Point
     score: float
-    evaluations: int  # points that it asked for
+    evaluations: int  # requested points
     complete: bool  # whether no change improves the score; False: the budget ended first
 
 
