@@ -34,7 +34,7 @@ from night.folder_readers import (
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
-from servobench.fmus.compile import parse_platforms
+from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
