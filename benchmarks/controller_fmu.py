@@ -12,7 +12,7 @@ import numpy as np
 from measuring import asked_to_be_quick, microseconds, processor_time, table
 from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.controllers.servo import ServoController
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.harness.config.adapters import NoSettings
 from servobench.harness.config.fmu_controller import mapped_controller
 from servobench.harness.config.settings import Settings

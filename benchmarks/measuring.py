@@ -7,16 +7,10 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.figure import Figure
-
-if TYPE_CHECKING:
-    from servobench.plant.contract.checks import FloatArray
-    from servobench.plant.rendered.settings import RenderedConfig
-
-    MeasurePeriods: TypeAlias = Callable[[RenderedConfig, int], FloatArray]
 
 METHODS = ("ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac")
 PERIODS = 200  # of a run of the task random
@@ -58,25 +52,6 @@ def milliseconds(call: Callable[[], object]) -> float:
     start = time.process_time()
     call()
     return 1e3 * (time.process_time() - start)
-
-
-def print_periods(description: str | None, plant: str, kinds: Sequence[str], measure: MeasurePeriods) -> None:
-    """Print medians of a rendered plant's periods with and without table and floor, and ratios to the first kind.
-
-    Args:
-        description: of the benchmark.
-        plant: its name.
-        kinds: of what is measured, the bare calls of the engine first.
-        measure: returns the times of up to as many kinds, (kinds, repeats) ms.
-    """
-    from servobench.plant.rendered.settings import RenderedConfig
-
-    repeats, rows = 3 if asked_to_be_quick(description) else 200, []
-    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
-        medians = np.median(measure(config, repeats), axis=1)
-        for kind, value in zip(kinds, medians, strict=False):  # of an engine that is not installed there are none
-            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
-    print(table([f"period of `{plant}`", "a period", "× bare calls"], rows))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

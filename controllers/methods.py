@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
-from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part

@@ -16,7 +16,7 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Controller, Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator
-from servobench.controllers.initial import InitialJacobian
+from servobench.controllers.initial_jacobian import InitialJacobian
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import Platform, this_platform
+from servobench.fmus.compiler import Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections
 from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
 from servobench.fmus.reference import COMMAND, reference_run, table

@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from servobench.fmus.compile import CODE, Platform, compile_library, library_files
+from servobench.fmus.compiler import CODE, Platform, compile_library, library_files
 from servobench.fmus.model_description import (
     REFERENCES,
     Description,

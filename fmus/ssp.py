@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from servobench.fmus.compile import Platform
+from servobench.fmus.compiler import Platform
 from servobench.fmus.controller_export import COMMAND, FEATURE, POSITION, SEEN
 from servobench.fmus.model_description import UNITS
 from servobench.fmus.product import Product, tool, write_archive

@@ -57,7 +57,7 @@ def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
     """
     if lag == 0.0:
         return np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([period, 1.0])
-    gone = -math.expm1(-period / lag)  # share of a step in the velocity that is reached after a period
+    gone = -math.expm1(-period / lag)  # share of a velocity step that is reached after a period
     return np.array([[1.0, lag * gone], [0.0, 1.0 - gone]]), np.array([period - lag * gone, gone])
 
 

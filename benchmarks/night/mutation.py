@@ -40,13 +40,13 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "estimators": (
         ("controllers/estimators/*.py",),
         ("controllers/test_estimators.py", "controllers/test_arm_estimator.py", "controllers/test_rbf.py",
-         "controllers/test_rbf_lyapunov.py", "controllers/test_estimator_lanes.py",
-         "controllers/test_correntropy.py", "controllers/test_robust.py"),
+         "controllers/test_estimator_lanes.py", "controllers/test_correntropy.py",
+         "controllers/test_robust_filter.py"),
     ),
     "laws": (
-        ("controllers/laws/*.py", "controllers/laws/mpc/*.py"),
+        ("controllers/laws/*.py", "controllers/laws/mpc/*.py", "controllers/periods.py"),
         ("controllers/test_pid.py", "controllers/test_mfac.py", "controllers/test_laws.py",
-         "controllers/test_preview.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
+         "controllers/test_periods.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
          "controllers/test_mpc_closed_form.py", "controllers/test_mpc_optimality.py"),
     ),
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),

@@ -34,10 +34,10 @@ from night.folder_readers import (
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
-from servobench.fmus.compile import parse_platforms
+from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
-from servobench.harness.batch.plan import parse_seeds, parse_variation, refuse_tuning_seeds
+from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
 from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
 from servobench.harness.cli.studies import _numbers, _times
 from servobench.harness.config.robots import find_robot
@@ -227,7 +227,7 @@ ZIP_WORDS = ("PK\x01\x02", "PK\x03\x04", "PK\x05\x06", "PK\x06\x06", "\xff\xff\x
 WORDS: dict[str, Parser] = {
     "--seeds": Parser(_seeds, ("5", "3,1,4", "100:120", "7,"), (",", ":", *NUMBERS), 4),
     "--vary": Parser(
-        lambda text, _: parse_variation(text),
+        lambda text, _: SweepPlan.parse(Batch((), (), (), (), ()), [text]),
         ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1"),
         (*AXIS_WORDS, *NUMBERS),
         4,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from fmpy.ssp.simulation import simulate_ssp
 
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.fmus.ssp import write_loop
 from servobench.harness.batch.api import run
 from servobench.harness.config.settings import ConfigurationError, Settings

@@ -12,7 +12,7 @@ import pytest
 
 from kit.controller_fmus import experiment, inputs_of, periods, recorded
 from night.other_machines import drive, machines, unpack
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.fmus.export import ExportOptions, product
 
 PERIOD = 0.05

@@ -144,7 +144,7 @@ ModelStatus model_step(Model *model, double step)
         const ModelStatus status = take_sample(model);
         if (status != MODEL_OK) return status;
     }
-    model->touched = 0; /* what was set before its end is not of the instant at its end */
+    model->touched = 0; /* earlier inputs are not those of the instant at the end of the step */
     return MODEL_OK;
 }
 

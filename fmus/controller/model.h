@@ -35,7 +35,7 @@ typedef enum {
     MODEL_BAD_VALUE,
     MODEL_NO_DERIVATIVES,
     MODEL_TOO_LONG,
-    MODEL_NOT_FINITE, /* this and what follows ends a run */
+    MODEL_NOT_FINITE, /* this and the following ones end a run */
     MODEL_NOT_DEFINITE,
     MODEL_NO_MEMORY
 } ModelStatus;

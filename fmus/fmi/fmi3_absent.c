@@ -1,10 +1,10 @@
 /* Functions that FMI 3.0 requires of every library and this model does not have: other types, clocks, interfaces. */
 #ifdef __GNUC__
-#pragma GCC diagnostic ignored "-Wunused-parameter" /* that is what absent means */
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* absent functions use none of them */
 #endif
 #include "fmi3_instance.h"
 
-/* Any phase: whatever is asked, there is nothing of the kind. */
+/* In any phase: the model has nothing of the kind. */
 static fmi3Status refuse(const Instance *instance, const char *function, const char *message)
 {
     return instance == NULL ? fmi3Error : answer(instance, function, message);
@@ -34,7 +34,7 @@ ABSENT_TYPE(UInt64)
 ABSENT_TYPE(Boolean)
 ABSENT_TYPE(String)
 
-/* Functions of which this model has no use: they fail, whatever they are given. */
+/* Functions of capabilities that this model does not have: they always fail. */
 #define ABSENT(name, ...) \
     fmi3Status name(__VA_ARGS__) { return refuse(i, #name, "this FMU has no such capability"); }
 

@@ -49,7 +49,7 @@ const char *core_leave_initialisation(Core *core);
 const char *core_get(Core *core, size_t index, double *value);
 const char *core_set(Core *core, size_t index, double value);
 const char *core_step(Core *core, double time, double step);
-/* Solvers evaluate the equations beyond the stop time as well; what ends a step or changes a state may not. */
+/* Solvers evaluate the equations beyond the stop time as well; ends of steps and changes of states may not lie there. */
 const char *core_check_stop_time(const Core *core);
 const char *core_update_discrete_states(Core *core, int *states_changed);
 /* NULL without memory. */

@@ -142,8 +142,8 @@ int model_next_event(Model *model, char text[MESSAGE_SIZE])
     for (int i = 0; i < N_JOINTS; i++) {
         const int held = model->held[i];
         if (held == model->reported[i]) continue;
-        const char *what = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
-        (void)snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, model->time);
+        const char *state = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
+        (void)snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, state, model->time);
         model->reported[i] = held;
         return 1;
     }

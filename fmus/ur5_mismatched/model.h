@@ -28,7 +28,7 @@ typedef struct {
     double decay[N_JOINTS];      /* v+ = decay v + (1 - decay) u */
     int exchange;                /* a solver integrates the model: joints are held and freed at events only */
     int held[N_JOINTS];          /* 1 by its upper stop, -1 by its lower one, 0 free */
-    int reported[N_JOINTS];      /* what the log knows of `held` */
+    int reported[N_JOINTS];      /* values of `held` in the last log messages */
     int stale;                   /* which computed values are out of date */
 } Model;
 
@@ -40,7 +40,7 @@ typedef enum {
     MODEL_BAD_VALUE,
     MODEL_EMPTY_RANGE,
     MODEL_BEYOND_STOP,
-    MODEL_NOT_FINITE /* this and what follows ends a run */
+    MODEL_NOT_FINITE /* this and the following ones end a run */
 } ModelStatus;
 
 #include "model_functions.h"

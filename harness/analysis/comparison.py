@@ -13,7 +13,6 @@ A run that did not complete never settled, even if its error was small before: s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -31,12 +30,13 @@ from servobench.harness.analysis.statistics import (
 )
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
-CONDITION: Final = ("plant", "sensing", "task", "mismatch", "noise_factor", "latency_s", "period_s")
+CONDITION: Final = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
 HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
 
@@ -62,19 +62,26 @@ class Comparison:
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Return the runs of each plant, task and condition, with words for it, in order of appearance."""
-    known = [name for name in CONDITION if name in runs]
+    varied = varied_columns(runs.columns)
+    known = [*(name for name in CONDITION if name in runs), *varied]
     found = []
     for key, group in runs.groupby(known, sort=False, dropna=False):
         values: dict[str, Any] = dict(zip(known, key, strict=True))
         words = f"{values['task']} on {place_name(values['plant'], values.get('sensing'))}, {values['mismatch']}"
         if values.get("noise_factor", 1.0) != 1.0:
             words += f", noise × {values['noise_factor']:g}"
-        for name in ("latency", "period"):
-            time = float(values.get(f"{name}_s", float("nan")))
-            if math.isfinite(time):
-                words += f", {name} {1e3 * time:g} ms"
+        for name, (heading, factor) in varied.items():
+            if name != "noise_factor" and not pd.isna(values[name]):
+                words += f", {_in_words(heading, values[name], factor)}"
         found.append((words, group))
     return found
+
+
+def _in_words(heading: str, value: Any, factor: float) -> str:  # noqa: ANN401 - a cell of the table of runs
+    """Return a value with the name and the unit of its heading, such as `latency 50 ms`."""
+    name, _, unit = heading.removesuffix("]").partition(" [")
+    shown = f"{factor * value:g}" if isinstance(value, float) else str(value)
+    return f"{name} {shown}{f' {unit}' * bool(unit)}"
 
 
 def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs

@@ -11,6 +11,7 @@ from pyarrow import ArrowException
 
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
 
 DESCRIBED: Final = {
@@ -22,7 +23,7 @@ DESCRIBED: Final = {
     "noise_factor": "noise factor",
     "latency_s": "latency [s]",
     "period_s": "period [s]",
-}  # column -> heading
+}  # column -> heading; settings that are varied, too, have their key
 MAX_LISTED: Final = 15  # values of a column
 
 
@@ -35,7 +36,8 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in DESCRIBED.items() if name in runs}
+    described = DESCRIBED | {name: name for name in runs.columns if name.startswith(SECTIONS)}
+    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in described.items() if name in runs}
     packages = manifest.get("packages") or {}
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
     commit = manifest.get("git_commit")

@@ -36,18 +36,11 @@ from servobench.harness.run.outcome import (
     OUTCOMES,
     TARGET_UNREACHABLE,
 )
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about
-CONDITIONS: Final = {
-    "plant": ("plant", 1.0),
-    "robot": ("robot", 1.0),
-    "sensing": ("sensing", 1.0),
-    "mismatch": ("mismatch", 1.0),
-    "noise_factor": ("noise factor", 1.0),
-    "latency_s": ("latency [ms]", 1e3),
-    "period_s": ("period [ms]", 1e3),
-}  # column -> heading and factor
+CONDITIONS: Final = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
 GROUPS: Final = {
     "moves": ("Time", "Error", "Motion"),
     "curves": ("RMS error", "Motion"),
@@ -154,8 +147,9 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     runs = in_handy_units(runs)
     named = runs.assign(outcome=outcomes(runs))
     table: dict[tuple[str, str], list[str]] = {}
+    headings = varied_columns(runs.columns)
     for name in ("controller", "task", *_varied(runs)):
-        heading, factor = CONDITIONS.get(name, (name, 1.0))
+        heading, factor = headings.get(name, (name, 1.0))
         table[WHICH, heading] = [_condition(value, factor) for value in named[name]]
     table[WHICH, "seed"] = named["seed"].astype(str).tolist()
     for name in ("status", "outcome"):
@@ -197,11 +191,11 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
 def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> list[tuple[Row, pd.DataFrame]]:
     names = [*(_varied(runs) if keys is None else keys), *more]
     order = {name: i for i, name in enumerate(ordered(runs["controller"]))}
-    found = []
+    headings, found = varied_columns(runs.columns), []
     for key, own in runs.groupby([*names, "controller"], sort=False, dropna=False):
         row: Row = {(WHICH, "controller"): str(key[-1])}
         for name, value in zip(names, key, strict=False):
-            heading, factor = CONDITIONS.get(name, (name, 1.0))
+            heading, factor = headings.get(name, (name, 1.0))
             row[WHICH, heading] = _condition(value, factor)
         found.append((row, own))
     places = list(dict.fromkeys(tuple(row.values())[1:] for row, _ in found))
@@ -212,7 +206,8 @@ def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> 
 
 def _varied(runs: pd.DataFrame) -> list[str]:
     """Return the columns of conditions that differ between the runs."""
-    return [name for name in CONDITIONS if name in runs and runs[name].nunique(dropna=False) > 1]
+    known = (*CONDITIONS, *varied_columns(runs.columns))
+    return [name for name in known if name in runs and runs[name].nunique(dropna=False) > 1]
 
 
 def _columns(kind: str, runs: pd.DataFrame) -> list[tuple[str, str]]:

@@ -38,17 +38,18 @@ from servobench.harness.analysis.statistics import (
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.metrics import METRICS, Summary
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
+from servobench.harness.run.request import SECTIONS, SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
-SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
-CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
 TAIL: Final = 0.95
 Row: TypeAlias = "dict[str, Cell]"
 BAND: Final = ("settling_band", "feature_unit")
 SWEEP_COLUMNS: Final = (
-    *CONDITIONS,
+    "plant",
+    "mismatch",
+    *(short.column for short in SHORT_NAMES.values()),
     "sensing",
     "task",
     "controller",
@@ -232,10 +233,11 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     for part in parts:
         counted.append(_count_outcomes(part))
         curves |= set(split_tasks(part)[1]["task"])
-    counts = pd.concat(counted).groupby([*SWEEP_KEYS, "outcome"], sort=False, as_index=False)["runs"].sum()
+    keys = _sweep_keys(counted[0])
+    counts = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
-        sums = place.assign(good=good).groupby(SWEEP_KEYS[2:], sort=False)[["good", "runs"]].sum()
+        sums = place.assign(good=good).groupby(keys[2:], sort=False)[["good", "runs"]].sum()
         table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
         table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
         word = FOLLOWED if task in curves else SETTLED
@@ -260,8 +262,19 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
         noise=runs["noise_factor"].map("{:g}".format),
         latency=_milliseconds(runs["latency_s"]),
         period=_milliseconds(runs["period_s"]),
+        **{name: runs[name].map(_in_short) for name in runs.columns if name.startswith(SECTIONS)},
     )
-    return runs.groupby([*SWEEP_KEYS, "outcome"], sort=False).size().rename("runs").reset_index()
+    return runs.groupby([*_sweep_keys(runs), "outcome"], sort=False).size().rename("runs").reset_index()
+
+
+def _sweep_keys(runs: pd.DataFrame) -> list[str]:
+    """Return the columns that say which runs are counted together, the controller last."""
+    *keys, controller = SWEEP_KEYS
+    return [*keys, *(name for name in runs.columns if name.startswith(SECTIONS)), controller]
+
+
+def _in_short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _milliseconds(times: pd.Series[float]) -> list[str]:

@@ -30,7 +30,7 @@ from servobench.harness.config.settings import Assignment, ConfigurationError, S
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve_sections, select
+from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
 
 Row = dict[str, Any]
@@ -41,7 +41,7 @@ SOURCES: Final = (
     "own_tasks",
     "plugins",
 )  # entries that have the hash of code by its name
-REST: Final = "noise, latencies, periods, axes that are varied, or the command"  # of which a manifest has a digest only
+REST: Final = "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _carry_out_at(
         results.put_together(folder, manifest)
 
 
-def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: Workers) -> dict[str, Any]:
+def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: Workers) -> Sections:
     """Refuse runs that are impossible, before anything is written; networks that are needed are trained.
 
     The examples among the runs are built and thrown away; in a worker process where code of users is built, which may
@@ -212,37 +212,28 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
 class _Jobs:
     """Makes the jobs of a campaign; runs that differ in seed only share their settings."""
 
-    def __init__(self, campaign: Campaign, sections: dict[str, Any], *, together: bool) -> None:
+    def __init__(self, campaign: Campaign, sections: Sections, *, together: bool) -> None:
         self._cells, self._sections = campaign.cells, sections
         self._together = together and not campaign.steps
-        self._known: dict[tuple[object, ...], tuple[tuple[Any, ...], Hashable | None]] = {}
 
     def at(self, indices: Iterable[int]) -> Iterator[Job]:
         """Yield the jobs of some cells."""
         for index in indices:
             cell = self._cells[index]
-            run, kind = self._resolve(cell.request)
-            yield Job(index, cell, run, None if cell.picture else kind)
+            run = select(cell.request, self._sections)
+            yield Job(index, cell, run, None if cell.picture else self._kind(run))
 
     def side_by_side(self, examples: Iterable[RunRequest]) -> dict[str, list[str]]:
         """Return by plant the controllers whose runs advance together."""
         found: dict[str, dict[str, None]] = {}
         for request in examples:
-            if self._resolve(request)[1] is not None:
+            if self._kind(select(request, self._sections)) is not None:
                 found.setdefault(request.plant, {})[request.controller] = None
         return {plant: list(controllers) for plant, controllers in found.items()}
 
-    def _resolve(self, request: RunRequest) -> tuple[ResolvedRun, Hashable | None]:
-        """Return a run with its settings, and its kind if it may advance with others."""
-        names = request.plant, request.controller, request.task
-        sensor = request.noise_factor, request.latency, request.sensing
-        known = (*names, request.mismatch, *sensor, request.period, request.robot)
-        if known not in self._known:
-            first = select(request, self._sections)
-            settings = first.run, first.plant, first.controller, first.task
-            self._known[known] = settings, side_by_side_key(first) if self._together else None
-        settings, kind = self._known[known]
-        return ResolvedRun(request, *settings), kind
+    def _kind(self, run: ResolvedRun) -> Hashable | None:
+        """Return the kind of a run if it may advance with others of its kind."""
+        return side_by_side_key(run) if self._together else None
 
 
 def _carry_out_missing(
@@ -292,15 +283,14 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
 
 
 def _without_effect(assignment: Assignment, examples: Iterable[RunRequest], steps: bool) -> str:
-    match assignment.section, assignment.key:
-        case "run", "full_jacobian" if not steps:
-            return "this command keeps no steps, which hold the Jacobians"
-        case "run", "camera_moves_at" if not any(run.mismatch.size("camera_move") for run in examples):
-            return "no mismatch moves the camera, as camera_move=90deg does"
-        case "run", "period" if all(run.period is not None for run in examples):
-            return "--period gives the control period of every run"
-        case plant, "sensing.latency" if all(run.latency is not None for run in examples if run.plant == plant):
-            return "--latency gives the latency of every run"
+    key = f"{assignment.section}.{assignment.key}"
+    own = [run for run in examples if assignment.section in ("run", run.plant, run.controller, run.task)]
+    if own and all(run.varies(key) for run in own):
+        return f"all runs vary {key}"
+    if key == "run.full_jacobian" and not steps:
+        return "this command keeps no steps, which hold the Jacobians"
+    if key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
+        return "no mismatch moves the camera, as camera_move=90deg does"
     return ""
 
 

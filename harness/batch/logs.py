@@ -10,8 +10,8 @@ import pandas as pd
 
 from servobench.harness.batch import results
 from servobench.harness.config.robots import OWN_ROBOT
-from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.request import TIMES, RunRequest
+from servobench.harness.config.settings import ConfigurationError, Settings, nest
+from servobench.harness.run.request import RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
@@ -54,13 +54,16 @@ def logged_in_folder(folder: Path, run_id: str | None, controller: str | None) -
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
     configuration = results.read_manifest(folder).get("configuration", {})
     read = ["run", row["plant"], row["task"], *([] if controller else [row["controller"]])]
-    sections = {name: _nested(configuration.get(name, {})) for name in read}
-    names = ("plant", "task", "mismatch", "seed", "noise_factor", "robot", "sensing")
-    times = {name: float(row[f"{name}_s"]) for name in TIMES if pd.notna(row.get(f"{name}_s"))}
-    asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])} | times
+    sections = {name: nest(configuration.get(name, {})) for name in read}
+    names = ("plant", "task", "mismatch", "robot", "sensing")
+    asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
         del asked["robot"]
-    return resolve(RunRequest(controller=controller or row["controller"], **asked), Settings(sections)), steps
+    varied = varied_in_row(row)
+    if controller:
+        varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
+    request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)
+    return resolve(request, Settings(sections)), steps
 
 
 def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tuple[ResolvedRun, pd.DataFrame]:
@@ -87,18 +90,5 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
         raise ConfigurationError(f"{path} is no table with a column time_s: {error}") from error
     if not period > 0.0:
         raise ConfigurationError(f"{path} needs two rows or more whose time_s grows; it has {len(table)}")
-    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, period=period, robot=robot, sensing=sensing)
+    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, (("period", period),), robot, sensing)
     return resolve(request, Settings()), table
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by nested keys of those by dotted keys; settings without a value are left out."""
-    nested: dict[str, Any] = {}
-    for key, value in flat.items():
-        *path, name = key.split(".")
-        target = nested
-        for part in path:
-            target = target.setdefault(part, {})
-        if value is not None:
-            target[name] = value
-    return nested

@@ -8,22 +8,24 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
+import tomllib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from textwrap import shorten
-from typing import Any, Final, Generic, TypeAlias, TypeVar, overload
+from typing import Any, Final, Generic, Self, TypeVar, overload
 
 import numpy as np
 
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.request import SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
+from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 MAX_SEEDS: Final = 1_000_000  # of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
@@ -187,18 +189,40 @@ class Grid(Sequence[Entry_co], Generic[Entry_co]):
         return self._make(*reversed(values))
 
 
-Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
-
-
 @dataclass(frozen=True)
 class SweepPlan:
-    """All combinations of these; each variation is put on top of every mismatch by itself, not with the others."""
+    """The runs of a batch under variations.
+
+    Each axis of the mismatch is put on top of every mismatch by itself, not with the other axes. Settings are varied in
+    all combinations, with each other and with all else.
+    """
 
     batch: Batch  # plants, controllers, tasks, mismatches and seeds
-    variations: tuple[Variation, ...] = ()  # axes with their magnitudes
-    noise_factors: tuple[float, ...] = (1.0,)  # on the plants' sensor noise
-    latencies: tuple[float | None, ...] = (None,)  # [s]; None for what a plant is configured with
-    periods: tuple[float | None, ...] = (None,)  # [s] of control; None for that of the section `run`
+    axes: tuple[tuple[str, tuple[Magnitude, ...]], ...] = ()  # of the mismatch, with their magnitudes
+    settings: tuple[tuple[str, tuple[Value, ...]], ...] = ()  # by short name or `SECTION.KEY`, with their values
+
+    @classmethod
+    def parse(cls, batch: Batch, variations: Iterable[str]) -> Self:
+        """Return the plan of a batch with the variations that a user wrote.
+
+        Args:
+            batch: the runs.
+            variations: of an axis, `camera_rotation=0:180:30deg`, or of a setting, `run.period=0.02,0.05`.
+
+        Raises:
+            ConfigurationError: an unknown axis, values that are malformed, empty or repeated, or one setting twice.
+        """
+        axes, settings = [], dict[str, tuple[Value, ...]]()
+        for text in variations:
+            name, _, values = (part.strip() for part in text.partition("="))
+            if name not in SHORT_NAMES and "." not in name:
+                axes.append(parse_axis(name, values))
+            elif name in settings:
+                raise ConfigurationError(f"--vary gives {name} twice; give all values in one place")
+            else:
+                settings[name] = parse_values(name, values)
+        in_order = sorted(settings.items(), key=lambda pair: [*SHORT_NAMES, pair[0]].index(pair[0]))
+        return cls(batch, tuple(axes), tuple(in_order))
 
     def cells(self) -> Grid[Cell]:
         """Return the runs, seeds varying fastest.
@@ -206,18 +230,37 @@ class SweepPlan:
         Raises:
             ConfigurationError: an axis that is varied and stands in a mismatch, too.
         """
-        for axis, _ in self.variations:
+        for axis, _ in self.axes:
             for text in self.batch.mismatches:
                 if axis in dict(read_mismatch(text).axes):
                     raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
-        places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
-        make = partial(_cell, self.batch.robot)
-        return Grid(make, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())
+        places = [Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes]
+        varied = Grid(partial(_varied, [name for name, _ in self.settings]), *(values for _, values in self.settings))
+        return Grid(partial(_cell, self.batch.robot), places or [Place()], varied, *self.batch.axes())
+
+
+def _varied(keys: Sequence[str], *values: Value) -> Varied:
+    return tuple(zip(keys, values, strict=True))
+
+
+def _cell(
+    robot: str,
+    place: Place,
+    varied: Varied,
+    sensing: str,
+    plant: str,
+    task: str,
+    mismatch: Mismatch,
+    *names: Any,  # noqa: ANN401
+) -> Cell:
+    controller, seed = names
+    request = RunRequest(plant, controller, task, place.vary(mismatch), seed, varied, robot, sensing)
+    return Cell(request, place.columns)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a run stands on the axis that is varied; without an axis, none is."""
+    """A point on the axis that is varied; without an axis, none is."""
 
     axis: str = ""
     magnitude: Magnitude | None = None
@@ -239,38 +282,49 @@ def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
     return mismatch.with_axis(axis, magnitude)
 
 
-OWN_OPTIONS = {"noise": "noise 0,1,2", "latency": "latency 0,0.05,0.1", "period": "period 0.02,0.05"}
+def parse_axis(axis: str, values: str) -> tuple[str, tuple[Magnitude, ...]]:
+    """Return an axis and its magnitudes, given as `begin:end:step` (both ends included) or `one/another`.
 
-
-def parse_variation(text: str) -> Variation:
-    """Return the axis and the magnitudes in `axis=begin:end:step` (both ends included) or `axis=one/another`.
-
-    The unit stands at the end, as in `camera_rotation=0:180:30deg`.
+    The unit stands at the end, as in `0:180:30deg`.
 
     Raises:
         ConfigurationError: an unknown axis, or an empty or malformed range.
     """
-    axis, _, values = text.strip().partition("=")
-    if axis in OWN_OPTIONS:
-        raise ConfigurationError(f"--vary: {axis} is no axis of the mismatch and has an option, --{OWN_OPTIONS[axis]}")
     try:
         return axis, parse_magnitudes(axis, values)
     except ValueError as error:
         raise ConfigurationError(f"--vary: {error}") from error
 
 
-def _cell(
-    robot: str,
-    place: Place,
-    noise: float,
-    latency: float | None,
-    period: float | None,
-    *names: Any,  # noqa: ANN401 - as `Batch.axes`
-) -> Cell:
-    sensing, plant, task, mismatch, controller, seed = names
-    varied = place.vary(mismatch)
-    request = RunRequest(plant, controller, task, varied, seed, noise, latency, period, robot, sensing)
-    return Cell(request, place.columns)
+def parse_values(name: str, text: str) -> tuple[Value, ...]:
+    """Return the values of a setting: `begin:end:step` (both ends included) or values as in TOML with commas between.
+
+    Whole numbers become floats where others are floats, so that a column has one type.
+
+    Raises:
+        ConfigurationError: there is no value, one stands there twice, or the range is malformed or empty.
+    """
+    values: Sequence[Any]
+    if re.fullmatch(r"[-+0-9.e]+(:[-+0-9.e]+){2}", text):
+        try:
+            values = parse_range(name, text)
+        except ValueError as error:
+            raise ConfigurationError(f"--vary: {error}") from error
+    else:
+        try:
+            values = tomllib.loads(f"values = [{text}]")["values"]
+        except (ValueError, RecursionError):
+            values = [part.strip() for part in text.split(",")]  # bare words
+    numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
+    if numeric and any(isinstance(each, float) for each in values):
+        values = [float(each) for each in values]
+    found = tuple(values)
+    if not found or "" in found:
+        raise ConfigurationError(f"--vary {name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2")
+    for k, each in enumerate(found):
+        if each in found[:k]:
+            raise ConfigurationError(f"--vary {name} names {each} twice")
+    return found
 
 
 @dataclass
@@ -286,7 +340,7 @@ class Survey:
     sensings: dict[str, None] = field(default_factory=dict)
     seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
     examples: list[RunRequest] = field(default_factory=list)
-    """With every plant in every condition (mismatch, noise, times) and with every controller, and every task."""
+    """With every plant in every condition (mismatch, varied settings) and with every controller, and every task."""
     digest: str = ""  # of all runs in their order
 
 
@@ -305,12 +359,12 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
         seeds.add(request.seed)
-        times = request.latency, request.period
-        condition = (request.mismatch, request.noise_factor, *times, request.robot, request.sensing)
+        condition = (request.mismatch, request.varied, request.robot, request.sensing)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
             continue
-        new = {(request.plant, condition), (request.plant, request.controller), (request.task,)} - seen
+        own = request.controller, request.varied_in("controller")
+        new = {(request.plant, condition), (request.plant, *own), (request.task, request.varied_in("task"))} - seen
         if new:
             seen |= new
             found.examples.append(request)

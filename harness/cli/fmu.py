@@ -15,7 +15,7 @@ from servobench.harness.cli.options import CONTROLLER, command, option
 from servobench.harness.cli.terminal import FAILED, console, refuse, say
 
 if TYPE_CHECKING:
-    from servobench.fmus.compile import Platform
+    from servobench.fmus.compiler import Platform
     from servobench.fmus.product import Product
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
@@ -45,7 +45,7 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        from servobench.fmus.compile import parse_platforms
+        from servobench.fmus.compiler import parse_platforms
 
         try:
             yield parse_platforms(self.platforms)

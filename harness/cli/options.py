@@ -49,7 +49,13 @@ ROBOT = Value("NAME", selection.complete_robots, selection.known_robot)
 SENSING = Value("NAME", selection.complete_sensings, selection.known_sensing)
 
 
-def option(name: str, value: Value | str, words: str, absent: Mapping[str, str] | None = None, **further: Any) -> Any:  # noqa: ANN401 - typer's own word for it
+def option(
+    name: str,
+    value: Value | str,
+    words: str,
+    absent: Mapping[str, str] | None = None,
+    **further: Any,  # noqa: ANN401 - any argument of typer.Option
+) -> Any:  # noqa: ANN401 - typer's own word for it
     """Declare an option.
 
     Args:
@@ -99,9 +105,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     parameters = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=hint) for name, default, hint in rows
     ]
-    vars(call).update(
-        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
-    )
+    vars(call)["__signature__"] = Signature(parameters)
+    call.__annotations__ = {each.name: each.annotation for each in parameters}
     return call
 
 

@@ -33,17 +33,13 @@ def sweep(
         list[str] | None,
         option(
             "--vary",
-            "AXIS=VALUES",
-            "Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg.",
+            "KEY=VALUES",
+            "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05.",
         ),
     ] = None,
-    noise: Annotated[str, option("--noise", "NUMBERS", "Comma-separated factors on the plants' sensor noise.")] = "1",
-    latency: Annotated[
-        str, option("--latency", "SECONDS", "Comma-separated camera latencies [s]; default: the plant's.")
-    ] = "",
-    period: Annotated[
-        str, option("--period", "SECONDS", "Comma-separated control periods [s]; default: run.period.")
-    ] = "",
+    noise: Annotated[str, option("--noise", "NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
+    latency: Annotated[str, option("--latency", "SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
+    period: Annotated[str, option("--period", "SECONDS", "Control periods [s]: --vary period=...")] = "",
     running: options.Running,
     overrides: options.Overrides,
     judging: options.Judging,
@@ -55,44 +51,21 @@ def sweep(
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
-    from servobench.harness.batch.plan import SweepPlan, parse_variation
+    from servobench.harness.batch.plan import SweepPlan
     from servobench.harness.cli.progress import watching
+    from servobench.harness.run.request import SECTIONS
 
-    plan = SweepPlan(
-        combinations.batch(),
-        tuple(parse_variation(text) for text in vary or []),
-        tuple(_numbers("noise", noise)),
-        _times("latency", latency),
-        _times("period", period),
-    )
-    campaign = Campaign(plan.cells(), overrides.settings())
+    short = {"noise": noise, "latency": latency, "period": period}
+    variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
+    campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
     how = judging.execution(running)
     with watching(console, out, bar=not how.debug) as observer:
         carry_out(campaign, out, replace(how, observer=observer))
-    legend = sweep_legend(results.iterate_runs(out, SWEEP_COLUMNS))
-    print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), legend)
+    columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
+    legend = sweep_legend(results.iterate_runs(out, columns))
+    print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say(f"table in {out / results.RUNS}")
     judge(out, results.iterate_runs(out, ("status",)), strict=judging.strict)
-
-
-def _times(option: str, text: str) -> tuple[float | None, ...]:
-    """Return times, s; numbers from 1 on are refused because they were control periods in version 0.1."""
-    times = _numbers(option, text) if text.strip() else [None]
-    if max(time or 0.0 for time in times) >= 1.0:
-        refuse(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
-    return tuple(times)
-
-
-def _numbers(option: str, text: str) -> list[float]:
-
-    try:
-        numbers = [float(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        refuse(f"--{option} must be comma-separated numbers, got {text!r}")
-    if not numbers or min(numbers) < 0:
-        refuse(f"--{option} must be numbers from 0 on, got {text!r}")
-    selection.refuse_repetition(option, [f"{number:g}" for number in numbers])
-    return numbers
 
 
 def robustness(

@@ -140,6 +140,19 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
     return flat
 
 
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings by nested keys, given those by dotted key; None, a setting without a value, is left out."""
+    nested: dict[str, Any] = {}
+    for key, value in flat.items():
+        *path, name = key.split(".")
+        target = nested
+        for part in path:
+            target = target.setdefault(part, {})
+        if value is not None:
+            target[name] = value
+    return nested
+
+
 def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
     key, equals, text = assignment.partition("=")
     mapped = re.fullmatch(r"\s*(.+?\.toml)\.(.+)", key)  # a plant's name may be that of a file, fmu:crane.toml

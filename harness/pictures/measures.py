@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from pandas.api.types import is_numeric_dtype
 
 from servobench.harness.analysis.comparison import settled_share, settling_times, shown_unit
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
@@ -30,6 +31,7 @@ from servobench.harness.pictures.style import (
 )
 from servobench.harness.pictures.tracks import Ensembles
 from servobench.harness.run.metrics import METRICS
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
@@ -48,7 +50,6 @@ UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value 
 LINE_LETTERS: Final = 30  # of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
-SWEPT = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
 
 
 class _Dots(NamedTuple):
@@ -380,8 +381,8 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
     sweeps = {
         label: runs.assign(size=factor * runs[name].astype(float))
-        for name, (label, factor) in SWEPT.items()
-        if name in runs and any(own[name].nunique() > 1 for own in places)
+        for name, (label, factor) in varied_columns(runs.columns).items()
+        if is_numeric_dtype(runs[name]) and any(own[name].nunique() > 1 for own in places)
     }
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
         none = runs[runs["mismatch"] == "none"].assign(size=0.0)

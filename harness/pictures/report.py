@@ -54,6 +54,7 @@ from servobench.harness.pictures.style import (
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
+from servobench.harness.run.request import varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_atomically
@@ -243,8 +244,8 @@ def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
              for name, many in COUNTED.items()]  # fmt: skip
     words += [f"{name} {' and '.join(Path(str(each)).name for each in runs[name].unique())}"
               for name, usual in USUAL.items() if name in runs and (runs[name] != usual).any()]  # fmt: skip
-    words += [f"{runs[name].nunique(dropna=False)} {many}" for name, many in SWEPT.items()
-              if name in runs and runs[name].nunique(dropna=False) > 1]  # fmt: skip
+    words += [f"{runs[name].nunique(dropna=False)} {SWEPT.get(name, f'values of {name}')}"
+              for name in varied_columns(runs.columns) if runs[name].nunique(dropna=False) > 1]  # fmt: skip
     count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     return f"{count}: {', '.join(words)}; {'seeds' if runs['seed'].nunique() > 1 else 'seed'} {facts['seeds']}."
 
@@ -265,7 +266,8 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
     scales = {name: shown_unit(name, shown)[1] for name in known}
     place = shown.groupby(
-        ["controller", *(n for n in ("task", *groups.CONDITIONS) if n in shown)], dropna=False
+        ["controller", *(n for n in ("task", *groups.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
+        dropna=False,
     ).ngroup()
     runs = {
         str(number): {

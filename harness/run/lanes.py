@@ -262,8 +262,8 @@ def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
         return None
     moved = request.mismatch.size("camera_move") > 0.0
-    names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
-    return (*names, request.mismatch.sensor, request.sensing, id(run.run), id(run.controller), id(run.task))
+    names = request.plant, request.controller, request.task, moved, request.robot, request.sensing
+    return (*names, *map(id, (run.run, run.plant, run.controller, run.task)))
 
 
 def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:

@@ -1,13 +1,15 @@
-"""What a run is asked for: one cell of a comparison, and the settings that are common to all cells."""
+"""The request for a run: one cell of a comparison, and the settings that are common to all cells."""
 
 from __future__ import annotations
 
+import json
 import math
 import operator
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, Final, NamedTuple, SupportsIndex, TypeAlias
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
@@ -17,7 +19,39 @@ from servobench.plant.robot.mismatch import Mismatch
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
 NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a request that are texts
-TIMES = ("latency", "period")  # fields of a request, which are columns with the suffix _s
+
+
+class ShortName(NamedTuple):
+    """A short name for a setting that sweeps often vary; it has a column of its own, and a part of the run's name.
+
+    Attributes:
+        key: of the setting, `SECTION.KEY`.
+        column: in the table of runs.
+        heading: of this column where it is shown, with the unit.
+        usual: in this column for runs that do not vary the setting.
+        scale: from the value to the number that is shown.
+        unit: of this number.
+    """
+
+    key: str
+    column: str
+    heading: str
+    usual: float | None = None
+    scale: float = 1e3
+    unit: str = "ms"
+
+
+SHORT_NAMES: Final[Mapping[str, ShortName]] = {
+    "noise": ShortName("plant.sensing.noise_factor", "noise_factor", "noise factor", 1.0, 1.0, ""),
+    "latency": ShortName("plant.sensing.latency", "latency_s", "latency [ms]"),
+    "period": ShortName("run.period", "period_s", "period [ms]"),
+}
+ROLES: Final = ("plant", "controller", "task")
+SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))  # with which the key of a varied setting begins
+ORDER: Final = {short.key: order for order, short in enumerate(SHORT_NAMES.values())}
+
+Value: TypeAlias = float | int | bool | str | tuple["Value", ...]
+Varied: TypeAlias = tuple[tuple[str, Value], ...]
 
 
 @settings
@@ -58,7 +92,8 @@ class RunRequest:
     """One cell of a comparison.
 
     Raises:
-        ConfigurationError: a text that is no mismatch, a name that is no text, or a bad seed.
+        ConfigurationError: a text that is no mismatch, a name that is no text, a bad seed, or a varied setting of a
+            section that the run does not read.
     """
 
     plant: str
@@ -66,14 +101,14 @@ class RunRequest:
     task: str
     mismatch: Mismatch  # how far the true robot may be from the nominal one; its text is read, too
     seed: int  # of everything random in the run
-    noise_factor: float = 1.0  # multiplies the sensor noise that the plant is configured with
-    latency: float | None = None  # [s] of the camera; None for what the plant is configured with
-    period: float | None = None  # [s] of control; None for that of the section `run`
+    varied: Varied = ()
+    """settings of this run alone, by short name or `SECTION.KEY`; a mapping is read, too. Sections are `run`, `plant`,
+    `controller` and `task`, or the names of these three"""
     robot: str = DEFAULT_ROBOT  # a name, or the path of a file
     sensing: str = DEFAULT_SENSING  # a set-up, or the path of a file with one; with `:hand` for cameras on the hand
 
     def __post_init__(self) -> None:
-        """Check the names and the seed, and read a mismatch that came as text."""
+        """Check the names and the seed, and read a mismatch that came as text and settings of any order."""
         for name in NAMES:
             if not isinstance(getattr(self, name), str):
                 raise ConfigurationError(f"{name} must be a name, got {getattr(self, name)!r}")
@@ -82,23 +117,105 @@ class RunRequest:
         if isinstance(given, str):
             object.__setattr__(self, "mismatch", read_mismatch(given))
         object.__setattr__(self, "sensing", self.sensing.strip().removesuffix(f":{FIXED}"))
+        object.__setattr__(self, "varied", self._in_order(dict(self.varied)) if self.varied else ())
+
+    def _in_order(self, varied: Mapping[str, Value]) -> Varied:
+        """Return varied settings by role, those with short names first, so that equal runs are equal values."""
+        by_role = {self._by_role(key): _frozen(value) for key, value in varied.items()}
+        if len(by_role) < len(varied):
+            raise ConfigurationError(f"a setting is varied twice in {', '.join(varied)}")
+        for short in SHORT_NAMES.values():  # their columns hold numbers
+            if isinstance(value := by_role.get(short.key), int):
+                by_role[short.key] = float(value)
+        return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))
+
+    def _by_role(self, key: str) -> str:
+        """Return the key of a setting with the role of its section in place of a plant's, controller's or task's name.
+
+        Raises:
+            ConfigurationError: the run does not read such a section.
+        """
+        if key in SHORT_NAMES:
+            return SHORT_NAMES[key].key
+        if key.startswith(SECTIONS):
+            return key
+        for role in ROLES:
+            if key.startswith(f"{getattr(self, role)}."):
+                return f"{role}{key.removeprefix(getattr(self, role))}"
+        raise ConfigurationError(
+            f"the setting {key} cannot be varied in runs of {self.controller} on {self.plant}, task {self.task}: "
+            f"wanted SECTION.KEY with one of the sections run, {', '.join(ROLES)}, such as plant.sensing.latency"
+        )
+
+    def varied_in(self, role: str) -> Varied:
+        """Return the varied settings of a section, `run` or one of `ROLES`, by dotted key within it."""
+        return tuple((key.removeprefix(f"{role}."), each) for key, each in self.varied if key.startswith(f"{role}."))
+
+    def varies(self, key: str) -> bool:
+        """Return whether this run varies the setting of a key such as `kinematic.lag`."""
+        return bool(self.varied) and self._by_role(key) in dict(self.varied)
 
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
         mismatch, plant, controller = (
-            UNFIT_FOR_FILES.sub("_", str(name)) for name in (self.mismatch, self.plant, self.controller)
+            _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller)
         )
-        noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
-        times = "".join(f"-{name}{1e3 * value:g}ms" for name in TIMES if (value := getattr(self, name)) is not None)
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{UNFIT_FOR_FILES.sub('_', Path(self.robot).name)}-"
-        sensing = "" if self.sensing == DEFAULT_SENSING else f"{UNFIT_FOR_FILES.sub('_', Path(self.sensing).name)}-"
-        return f"{plant}-{robot}{sensing}{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
+        varied = "".join(map(_in_name, self.varied)) if self.varied else ""
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files(Path(self.robot).name)}-"
+        sensing = "" if self.sensing == DEFAULT_SENSING else f"{_fit_for_files(Path(self.sensing).name)}-"
+        return f"{plant}-{robot}{sensing}{controller}-{self.task}-{mismatch}{varied}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
-        """Return the columns by which a run is found in the table of runs."""
-        columns = {f"{name}_s" if name in TIMES else name: value for name, value in vars(self).items()}
-        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch)}
+        """Return the columns by which a run is found in the table of runs.
+
+        A varied setting is a column: that of its short name, or its key.
+        """
+        varied = dict(self.varied)
+        short = {each.column: varied.pop(each.key, each.usual) for each in SHORT_NAMES.values()}
+        names = {name: getattr(self, name) for name in ("run_id", "plant", "controller", "task")}
+        names |= {"mismatch": str(self.mismatch), "seed": self.seed, **short}
+        others = {key: json.dumps(value) if isinstance(value, tuple) else value for key, value in varied.items()}
+        return {**names, "robot": self.robot, "sensing": self.sensing, **others}
+
+
+def varied_in_row(row: Mapping[str, Any]) -> Varied:
+    """Return the settings that a run varies, by key, from its row in a table of runs."""
+    usual = {short.column: short.usual for short in SHORT_NAMES.values()}
+    columns = {short.column: short.key for short in SHORT_NAMES.values()} | {key: key for key in row if "." in key}
+    values = {name: row[name] for name in columns if row.get(name) not in (None, usual.get(name))}
+    given = [
+        (columns[name], json.loads(value) if str(value).startswith("[") else value) for name, value in values.items()
+    ]
+    return tuple((key, value) for key, value in given if not (isinstance(value, float) and math.isnan(value)))
+
+
+def varied_columns(columns: Iterable[str]) -> dict[str, tuple[str, float]]:
+    """Return the columns of settings that a run may vary with their headings and scales, those of short names first.
+
+    Args:
+        columns: of a table of runs.
+    """
+    known = {short.column: (short.heading, short.scale) for short in SHORT_NAMES.values()}
+    known |= {name: (name, 1.0) for name in columns if name.startswith(SECTIONS)}
+    return {name: known[name] for name in known if name in set(columns)}
+
+
+def _in_name(varied: tuple[str, Value]) -> str:
+    """Return the part of a run's name that says one varied setting; empty for the usual value of a short name."""
+    key, value = varied
+    for name, short in SHORT_NAMES.items():
+        if short.key == key and isinstance(value, int | float):
+            return "" if value == short.usual else f"-{name}{short.scale * value:g}{short.unit}"
+    return f"-{_fit_for_files(f'{key}={value}')}"
+
+
+def _frozen(value: Value | list[Value]) -> Value:
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+
+
+def _fit_for_files(text: str) -> str:
+    return UNFIT_FOR_FILES.sub("_", text)
 
 
 def read_mismatch(text: str) -> Mismatch:

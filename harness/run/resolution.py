@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from servobench.controllers.parts import ESTIMATORS, LAWS
@@ -17,18 +16,42 @@ from servobench.harness.config.registry import (
     plant_names,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.config.settings import ConfigurationError, Settings, nest
+from servobench.harness.run.request import RunRequest, RunSettings, Varied
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
-from servobench.plant.contract.sensing import change_sensing, vary_sensing
+from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
+
+
+class Sections(dict[str, Any]):
+    """The typed settings of a batch by section; runs that change them in the same way share one object."""
+
+    def __init__(self, sections: Mapping[str, Any]) -> None:
+        """Keep settings by section."""
+        super().__init__(sections)
+        self._changed: dict[tuple[str, Varied], Any] = {}
+
+    def with_changes(self, section: str, changes: Varied) -> Any:  # noqa: ANN401 - any configuration dataclass
+        """Return a section with some settings changed, by dotted key.
+
+        Raises:
+            ConfigurationError: an unknown key, or a value that cannot be used.
+        """
+        if not changes:
+            return self[section]
+        if (section, changes) not in self._changed:
+            try:
+                self._changed[section, changes] = override(section, self[section], nest(dict(changes)))
+            except ValueError as error:
+                raise ConfigurationError(str(error)) from error
+        return self._changed[section, changes]
 
 
 @dataclass(frozen=True)
 class ResolvedRun:
-    """All that a run depends on; it can be pickled. Plant and run have noise, latency and period of the request."""
+    """All that a run depends on; it can be pickled. The settings have the values that the request varies."""
 
     request: RunRequest
     run: RunSettings
@@ -46,7 +69,7 @@ def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
     return select(request, resolve_sections([request], settings))
 
 
-def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True) -> dict[str, Any]:
+def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True) -> Sections:
     """Return the typed settings of every section that `requests` read, by name.
 
     Args:
@@ -75,7 +98,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
         for name in dict.fromkeys(each.controller for each in requests)
     }
     defaults |= {name: fitted(name, robot) for name in dict.fromkeys(each.task for each in requests)}
-    return {name: settings.resolve(name, default) for name, default in defaults.items()}
+    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()})
 
 
 def _common_robot(requests: Iterable[RunRequest]) -> Robot:
@@ -92,36 +115,25 @@ def _plant_default(name: str, entry: PlantEntry, robot: Robot) -> Any:  # noqa: 
     return entry.config() if entry.config_for is None else entry.config_for(robot)
 
 
-def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
+def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     """Return `request` with its settings out of those that `resolve_sections` returned.
 
     Raises:
-        ConfigurationError: a noise factor, latency or axis of the sensor for a plant that has no such setting, or a
-            number that is out of its bounds.
+        ConfigurationError: a setting that is varied, or that an axis of the mismatch stands for, which the plant,
+            controller or task does not have; a value out of its bounds; or one setting in both.
     """
-    plant, run = sections[request.plant], sections["run"]
-    if request.noise_factor != 1.0 or request.latency is not None or request.mismatch.sensor:
-        try:
-            plant = vary_sensing(plant, request.noise_factor, request.latency)
-            plant = change_sensing(plant, request.mismatch.disturbed)
-        except ValueError as error:
-            raise ConfigurationError(f"plant {request.plant}: {error}") from error
-    if request.period is not None:
-        run = _with_period(run, request.period)
-    return ResolvedRun(request, run, plant, sections[request.controller], sections[request.task])
-
-
-@lru_cache
-def _with_period(run: RunSettings, period: float) -> RunSettings:
-    """Return the same object for all runs of a period [s], so that they can advance together.
-
-    Raises:
-        ConfigurationError: a period that is not positive.
-    """
-    try:
-        return replace(run, period=period)
-    except ValueError as error:
-        raise ConfigurationError(f"run: {error}") from error
+    of_sensor = request.mismatch.plant_settings
+    plant = request.varied_in("plant")
+    for key, _ in plant:
+        if key in of_sensor:
+            raise ConfigurationError(f"plant.{key} is varied, and the mismatch {request.mismatch} sets it, too")
+    return ResolvedRun(
+        request,
+        sections.with_changes("run", request.varied_in("run")),
+        sections.with_changes(request.plant, (*of_sensor.items(), *plant)),
+        sections.with_changes(request.controller, request.varied_in("controller")),
+        sections.with_changes(request.task, request.varied_in("task")),
+    )
 
 
 def check_settings(settings: Settings, running: Iterable[str]) -> None:

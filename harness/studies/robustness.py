@@ -120,8 +120,8 @@ def _cell(place: Place, request: RunRequest) -> Cell:
     if place.magnitude is None or place.axis not in (LATENCY, NOISE):
         return Cell(replace(request, mismatch=place.vary(request.mismatch)), place.columns)
     number = place.magnitude.number
-    late = replace(request, latency=number / 1000.0) if place.axis == LATENCY else None
-    return Cell(late or replace(request, noise_factor=number), place.columns)
+    varied = ((place.axis, number / 1000.0 if place.axis == LATENCY else number),)
+    return Cell(replace(request, varied=varied), place.columns)
 
 
 def make_map(

@@ -29,7 +29,7 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""
-NEAREST: Final = 0.25  # of the planned distance, the least depth that an interaction matrix takes
+NEAREST: Final = 0.25  # least depth in an interaction matrix, over the planned distance
 MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate are not valid
 
 

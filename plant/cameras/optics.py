@@ -20,7 +20,7 @@ from servobench.plant.contract.lanes import norm, outer
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
-CAMERA: Final = PinholeCamera()  # as planned, of every set-up in pixels
+CAMERA: Final = PinholeCamera()  # planned camera of every set-up in pixels
 NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
@@ -126,7 +126,7 @@ def _depth(points: FloatArray) -> FloatArray:
     depth = points[..., 2:]
     if depth.dtype != object:
         return np.maximum(depth, NEAR)
-    least = np.empty(depth.shape, dtype=object)  # of expressions, which have methods in place of numpy's functions
+    least = np.empty(depth.shape, dtype=object)  # Expressions have methods in place of numpy's functions.
     for index in np.ndindex(depth.shape):
         z: Any = depth[index]
         least[index] = z.fmax(NEAR)

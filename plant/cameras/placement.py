@@ -35,7 +35,7 @@ from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import camera_pose
 
-SIDE: Final = radians(60.0)  # of the second fixed camera's optical axis from the vertical
+SIDE: Final = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
 HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
 BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
 OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has

@@ -24,7 +24,7 @@ from servobench.plant.contract.checksums import append_sums, digest, fault, read
 
 FILES: Final = "files"
 UNFINISHED: Final = ".unfinished-"
-MAX_ENTRIES: Final = 32  # of a kind that are kept where they are older than `MIN_AGE`
+MAX_ENTRIES: Final = 32  # number of entries of a kind that are kept if they are older than `MIN_AGE`
 MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
 MAX_AGE: Final = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
 
@@ -52,7 +52,7 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
         if not is_whole(entry):
             _make(entry, make)
         _verified.add(entry)
-        with contextlib.suppress(OSError):  # of a cache that may only be read
+        with contextlib.suppress(OSError):  # The cache may be read-only.
             os.utime(entry)
     return entry / FILES
 
@@ -77,7 +77,7 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
             files = [path for path in sorted((fresh / FILES).rglob("*")) if path.is_file()]
             append_sums(fresh, {path.relative_to(fresh).as_posix(): digest(path) for path in files})
             with _alone(kind):
-                if not is_whole(entry):  # else another process was faster
+                if not is_whole(entry):  # Otherwise another process was faster.
                     _remove(entry)
                     fresh.rename(entry)
                 _prune(kind)
@@ -121,7 +121,7 @@ def _alone(kind: Path) -> Iterator[None]:
         except ImportError:
             pass
         else:
-            with contextlib.suppress(OSError):  # of a file system without locks
+            with contextlib.suppress(OSError):  # The file system may have no locks.
                 fcntl.flock(file, fcntl.LOCK_EX)
                 stack.callback(fcntl.flock, file, fcntl.LOCK_UN)
         yield

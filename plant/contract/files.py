@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or was when its process was killed
+PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

@@ -14,7 +14,7 @@ from servobench.plant.contract.checks import FloatArray
 Seeds: TypeAlias = int | Sequence[int]
 """The seed of a single run, or one for each of the runs side by side."""
 
-BLOCK = 64  # draws of a stream that are made at once
+BLOCK = 64  # number of draws of a stream at once
 
 
 def check_seed(seed: int) -> None:
@@ -77,7 +77,7 @@ class Stream:
         self._seeds = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
         for seed in self._seeds:
             check_seed(seed)
-        self._generators: list[np.random.Generator] = []  # made with the first block: many streams are never used
+        self._generators: list[np.random.Generator] = []  # Made with the first block, as many streams are never used.
         self._name, self._draw, self._shape, self._factor = name, draw, (BLOCK, *shape), factor
         self._block: FloatArray = np.empty(0)
         self._used = BLOCK

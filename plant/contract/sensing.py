@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
-from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 from annotated_types import Ge, Le
 
 from servobench.plant.contract.settings import NonNegative, Number, Positive, Share, ShareBelowOne, settings
 
-Config = TypeVar("Config")
 Family: TypeAlias = Literal["white", "mixture", "bimodal", "stable", "uniform"]
 """A family of noise, as `servobench.plant.bench.noise` defines them."""
 Stability: TypeAlias = Annotated[float, Ge(0.5), Le(2.0)]
@@ -77,38 +75,6 @@ def without_disturbance(sensing: SensingConfig) -> SensingConfig:
     return SensingConfig(0.0, sensing.latency, frame_period=sensing.frame_period)
 
 
-def can_vary_sensing(config: object) -> bool:
-    """Return whether a plant with these settings has a nested section `sensing`."""
-    return isinstance(getattr(config, "sensing", None), SensingConfig)
-
-
-def change_sensing(config: Config, change: Callable[[SensingConfig], SensingConfig]) -> Config:
-    """Return a plant's settings with its section `sensing` changed.
-
-    Raises:
-        ValueError: the plant has no section `sensing`, or a number is out of its bounds.
-    """
-    if not can_vary_sensing(config):
-        raise ValueError("its noise and latency cannot be varied")
-    values: Any = config
-    changed: Config = replace(values, sensing=change(values.sensing))
-    return changed
-
-
-def vary_sensing(config: Config, noise_factor: float, latency: float | None) -> Config:
-    """Return a plant's settings with noise multiplied by a factor and, unless it is None, another latency [s].
-
-    Raises:
-        ValueError: see `change_sensing`.
-    """
-
-    def change(sensing: SensingConfig) -> SensingConfig:
-        late = sensing.latency if latency is None else latency
-        return replace(sensing, noise_factor=noise_factor * sensing.noise_factor, latency=late)
-
-    return change_sensing(config, change)
-
-
 LENGTH: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 SHARE: Final = {"%": 1e-2, "": 1.0}
 NUMBER: Final = {"": 1.0}
@@ -145,26 +111,28 @@ SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {
 }
 
 
-def disturbed(sensing: SensingConfig, axes: Iterable[tuple[str, float]]) -> SensingConfig:
-    """Return the settings of a sensor with some axes put on top.
+def sensor_settings(axes: Iterable[tuple[str, float]]) -> dict[str, float | str]:
+    """Return the settings of a sensor that some axes stand for, by their names in `SensingConfig`.
 
     Args:
-        sensing: the settings.
         axes: names of `SENSOR_AXES` with magnitudes in SI units.
 
     Raises:
         ValueError: a magnitude out of the bounds of its setting, or two families of noise.
     """
-    family: Family | None = None
+    changes: dict[str, Any] = {}
+    families: list[Family] = []
     for name, size in axes:
         axis = SENSOR_AXES[name]
-        if axis.family is not None:
-            if family is not None:
-                raise ValueError(f"noise is of one family, got {family} and {axis.family}; give one of them")
-            family = axis.family
-        change: dict[str, Any] = {axis.setting: size}
+        own: dict[str, Any] = {axis.setting: size}
         try:
-            sensing = replace(sensing, **change)
+            SensingConfig(**own)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
-    return sensing if family is None else replace(sensing, noise=family)
+        changes |= own
+        if axis.family is not None:
+            families.append(axis.family)
+            changes["noise"] = axis.family
+    if len(families) > 1:
+        raise ValueError(f"noise is of one family, got {families[0]} and {families[1]}; give one of them")
+    return changes

@@ -81,7 +81,7 @@ File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if i
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
-MAX_LISTED = 40  # names in an error message
+MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above"),
     "greater_than_equal": ("ge", "at least"),

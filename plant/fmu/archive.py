@@ -18,12 +18,19 @@ from typing import Final
 from servobench.plant.contract.cache import cached
 
 DESCRIPTION: Final = "modelDescription.xml"
-MAX_FILES: Final = 20_000  # in an archive
+MAX_FILES: Final = 20_000  # number of files in an archive
 MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
 MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
-MAX_RATIO: Final = 100.0  # of the unpacked size to that of the archive; libraries reach 5, tables of numbers 20
+MAX_RATIO: Final = 100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
 SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
-DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)  # not of the archive
+DISK: Final = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EIO,
+    errno.EACCES,
+)  # errors of the disk, not of the archive
 DAMAGES: Final = (  # raised by Python's reader of archives
     zipfile.BadZipFile,
     zlib.error,

@@ -21,10 +21,10 @@ from servobench.plant.contract.settings import suggest
 from servobench.plant.fmu.archive import DESCRIPTION
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
-MAX_NUMBERS: Final = 1_000_000  # that a variable holds
+MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
 IDENTIFIER: Final = re.compile(
     r"(?!\.)[\w.+ -]{1,200}"
-)  # a file's name without folders; the standard wants a word of C
+)  # a file name without folders; the standard wants an identifier of C
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
         raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI 2 or 3")
     try:
         return read_model_description(str(root), validate=False)
-    except Exception as error:  # fmpy raises bare ones of every kind
+    except Exception as error:  # fmpy raises exceptions of every kind.
         raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
 
 

@@ -33,10 +33,10 @@ from servobench.plant.fmu.library import (
 )
 
 Call: TypeAlias = Callable[[], None]
-Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # of numbers: the word in the names of functions, the type in memory
-RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
+Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word in the names of functions, type in memory
+RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
-MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
+MIN_PROGRESS = 1e-9  # least share of a step for a partial step
 
 
 class Port:
@@ -340,7 +340,7 @@ class Instance(ABC):
         """End and free the instance and unload a library of its own; calling it twice is allowed."""
         if self._component.value and not self.fatal:
             if self._begun:
-                with contextlib.suppress(ValueError):  # of an FMU that does not export it
+                with contextlib.suppress(ValueError):  # The FMU may not export it.
                     self.function("Terminate")(self._component)
             release = self.function("FreeInstance")
             release.restype = None
@@ -357,7 +357,7 @@ class Instance(ABC):
             FmuError: it is not.
         """
         if status > WARNING or status < OK:
-            self._begun = False  # after an error only its freeing is allowed
+            self._begun = False  # After an error an instance may only be freed.
             if status == FATAL:
                 condemn(self._library)
             raise self.log.failure(function, status)

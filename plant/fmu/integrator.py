@@ -16,8 +16,8 @@ from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.library import InstanceOptions
 
 RELATIVE_TOLERANCE: Final = 1e-8
-MAX_SOLVER_STEPS: Final = 100_000  # of CVode in one step
-MAX_EVENT_ITERATIONS: Final = 1000  # at one instant
+MAX_SOLVER_STEPS: Final = 100_000  # steps of CVode in one step of the plant
+MAX_EVENT_ITERATIONS: Final = 1000  # iterations at one instant
 
 
 class Exchanging(Protocol):

@@ -104,7 +104,7 @@ class MessageLog:
         level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
         logger.log(level, "%s: %s", self._name, text)
         word = STATUS_WORDS[status] if 0 <= status < len(STATUS_WORDS) else f"status {status}"
-        with suppress(OSError):  # no exception passes through the FMU that calls this
+        with suppress(OSError):  # No exception may pass through the FMU that calls this.
             self._append(f"{word}: {text}")
 
     def _append(self, line: str) -> None:

@@ -25,7 +25,7 @@ from servobench.plant.contract.settings import File, Names, Numbers, Positive, V
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.fmu.description import FmuDescription, total_size
 
-STEP_TOLERANCE: Final = 1e-6  # share of a step by which it may differ from a multiple of the FMU's own
+STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
 
 
 @settings

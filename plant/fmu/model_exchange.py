@@ -122,7 +122,7 @@ def _feature_function(
         builder.set_y(_resolve("features", features, outputs, f"outputs of {path.name}"))
         whole = builder.create("fmu", ["x", "u", "p"], ["y"])
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1]  # the lines before say where in CasADi
+        reason = str(error).strip().splitlines()[-1]  # The other lines name places in CasADi's code.
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
     q = casadi.MX.sym("joint_position", len(chosen))
     place = {name: i for i, name in enumerate(chosen)}

@@ -42,7 +42,7 @@ BITS: Final = {
     "Enumeration": 32,
     **{f"{sign}Int{bits}": bits for sign in ("", "U") for bits in (8, 16, 32, 64)},
 }
-EXACT: Final = 2**53  # up to which a float64 holds every whole number
+EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
 
 Setter = Callable[[Instance, int], None]

@@ -39,7 +39,7 @@ def without_banner(descriptor: int = STANDARD_ERROR) -> Iterator[None]:
     """Hold back the output to a file descriptor within the context, and write it afterwards without the banner."""
     try:
         kept = os.dup(descriptor)
-    except OSError:  # it is closed, so nothing can be printed
+    except OSError:  # The descriptor is closed, so nothing can be printed.
         yield
         return
     with tempfile.TemporaryFile() as aside:

@@ -133,7 +133,7 @@ class InPlace:
         self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
     ) -> None:
         """Take arrays without gaps; no result shares memory with an argument."""
-        self._arrays = *arguments, *results  # that the function points to
+        self._arrays = *arguments, *results  # The function keeps pointers to these arrays.
         self._buffer: Any
         self._buffer, self._evaluate = function.buffer()
         for i, array in enumerate(arguments):

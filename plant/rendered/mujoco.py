@@ -39,13 +39,13 @@ if mujoco.get_mju_user_warning() is None:
     # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
     mujoco.set_mju_user_warning(lambda _: None)
 
-LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # on Linux, the first choice first
-ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # part of other systems
+LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # on Linux, in order of preference
+ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # OpenGL platforms of other systems
 INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
-SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
+SLICES, STACKS = 24, 6  # mesh of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
-MAX_PARTS = 1000  # that are drawn
+MAX_PARTS = 1000  # largest number of drawn parts
 SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
 COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
@@ -141,7 +141,7 @@ class MujocoScene(Scene):
             raise ValueError("view needs the plant bullet: mujoco opens no window")
         self._model = _compile(room)
         self._data = mujoco.MjData(self._model)
-        mujoco.mj_forward(self._model, self._data)  # places the light
+        mujoco.mj_forward(self._model, self._data)  # also places the light
         self._ball = self._model.body(BALL_LINK).id
         self._drawn = mujoco.MjvScene(self._model, MAX_PARTS)
         for name in COSTLY:
@@ -344,7 +344,7 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
     option = spec.option
     option.timestep, option.gravity = PHYSICS_STEP, (0.0, 0.0, -GRAVITY)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # joints that are not finite shall show
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # Joints that are not finite have to be detected.
     for joint, lower, upper in zip(spec.joints, *machine.stops, strict=True):
         joint.limited, joint.range = True, (lower, upper)
     model = spec.compile()

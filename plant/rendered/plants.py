@@ -54,7 +54,7 @@ def mujoco_lacks() -> str:
     """Return how to install the renderer that this machine lacks; empty if it can render."""
     try:
         from servobench.plant.rendered.mujoco import missing_renderer  # noqa: PLC0415
-    except (ImportError, RuntimeError) as error:  # parts that do not fit, or a MUJOCO_GL that MuJoCo does not know
+    except (ImportError, RuntimeError) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
         return f"MuJoCo cannot be loaded: {error}"
     return missing_renderer()
 

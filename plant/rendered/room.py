@@ -45,9 +45,9 @@ HOUSING: Final = (
     0.02,
     0.06,
 )  # [m] radius and length of a camera on the hand, for a UR5; too near to be in its own image
-POSITION: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
-TARGET: Final = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
-CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
+OVERVIEW_POSITION: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
+OVERVIEW_TARGET: Final = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
+OVERVIEW_CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +184,14 @@ class Overview:
 
         Args:
             scale: of its workspace, over that of a UR5.
-            fineness: pixels for one pixel of `CAMERA`, along each side; above 1 edges become smooth once scaled down.
+            fineness: pixels for one pixel of `OVERVIEW_CAMERA`, along each side; above 1 edges become smooth once
+                scaled down.
         """
-        size = {"width": round(fineness * CAMERA.width), "height": round(fineness * CAMERA.height)}
-        return cls(replace(CAMERA, **size), _look_at(scale * np.array(POSITION), scale * np.array(TARGET)))
+        size = {"width": round(fineness * OVERVIEW_CAMERA.width), "height": round(fineness * OVERVIEW_CAMERA.height)}
+        return cls(
+            replace(OVERVIEW_CAMERA, **size),
+            _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET)),
+        )
 
     def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""

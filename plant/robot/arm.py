@@ -26,7 +26,7 @@ from servobench.plant.contract.checks import FloatArray, as_array, as_vector
 
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
-YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a vector: the partners in a cross product
+YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # indices of the factors in a cross product
 
 
 def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:

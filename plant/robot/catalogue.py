@@ -75,12 +75,12 @@ def _read(text: str, changed: int) -> Robot:
     return read_robot(text)
 
 
-RANDOM_ARM: Final = "random_arm"  # before a colon and the number
+RANDOM_ARM: Final = "random_arm"  # followed by a colon and the number
 MAX_NUMBER: Final = 1_000_000
-JOINTS: Final = (3, 7)  # fewest and most
+JOINTS: Final = (3, 7)  # least and largest number
 LENGTH: Final = 1.2  # [m] of all links, about that of a UR5
-SKEW: Final = math.radians(10.0)  # of a twist from the nearest quarter of a turn
-SHARE: Final = 0.6  # of the lengths and offsets that are not zero
+SKEW: Final = math.radians(10.0)  # largest deviation of a twist from a multiple of a quarter turn
+SHARE: Final = 0.6  # probability that a length or an offset is not zero
 LIMIT: Final = 0.9 * math.pi  # [rad] of a joint to either side
 SPEED: Final = math.pi  # [rad/s] of a joint
 MAX_DRAWS: Final = 200

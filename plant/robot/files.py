@@ -258,7 +258,7 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
     if tip and tip not in links:
         raise ValueError(f"it has no link {tip!r}; valid: {', '.join(links)}")
     ways = {name: _way(name, above) for name in ([tip] if tip else links)}
-    # The nearest of the links behind the last turning joint is the flange, before fingers and cameras.
+    # The nearest of the links after the last rotating joint is the flange; fingers and cameras follow.
     tip = max(ways, key=lambda name: (sum(map(_turns, ways[name])), -_after_last(ways[name])))
     tip = tip if not _is_last_body(ways, tip) else _flange(ways, tip)
     way = ways[tip]

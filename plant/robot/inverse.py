@@ -32,7 +32,7 @@ ITERATIONS: Final = 120
 CLOSE_ENOUGH: Final = 1e-6  # [m] a point counts as reached, and the search for it ends
 FIRST_DAMPING: Final = 1e-2  # [m²]
 DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
-SHRINK, GROW = 0.3, 4.0  # of the damping after a step that is taken, and after one that is not
+SHRINK, GROW = 0.3, 4.0  # factors on the damping after an accepted and after a rejected step
 
 
 def closest_distance(
@@ -133,9 +133,9 @@ def _step(
 
 
 POSE_ITERATIONS: Final = 100
-POSE_TOLERANCE: Final = 1e-9  # norm of the error, of lengths over the arm's and angles [rad], at which the search ends
+POSE_TOLERANCE: Final = 1e-9  # error norm at which the search ends; lengths over the arm's, angles in rad
 FIRST_POSE_DAMPING: Final = 1e-3
-POSE_SHRINK, POSE_GROW = 0.2, 5.0  # of the damping after a step that is taken, and after one that is not
+POSE_SHRINK, POSE_GROW = 0.2, 5.0  # factors on the damping after an accepted and after a rejected step
 
 
 def reach_pose(

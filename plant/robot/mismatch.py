@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from math import radians
 from typing import Self
 
@@ -30,7 +31,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, disturbed
+from servobench.plant.contract.sensing import SENSOR_AXES, sensor_settings
 from servobench.plant.contract.settings import nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
@@ -38,7 +39,7 @@ from servobench.plant.robot.robot import Robot
 
 MAX_TILT = radians(45.0)
 MAX_MOVE_TILT = radians(30.0)
-MAX_MAGNITUDES = 10_000  # of a range
+MAX_MAGNITUDES = 10_000  # largest number of magnitudes in a range
 
 
 def _unknown_word(text: str, word: str) -> ValueError:
@@ -81,7 +82,7 @@ class Mismatch:
                 check_number(axis, size, at_least=0.0, below=1.0)
             else:
                 check_number(axis, size, at_least=0.0, at_most=MAX_SIZE.get(next(iter(AXES[axis][0])), math.pi))
-        self.disturbed(SensingConfig())
+        _ = self.plant_settings
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -123,18 +124,15 @@ class Mismatch:
         given = dict(self.axes)
         return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
 
-    @property
-    def sensor(self) -> tuple[tuple[str, Magnitude], ...]:
-        """The axes of the sensor."""
-        return tuple((axis, magnitude) for axis, magnitude in self.axes if axis in SENSOR_AXES)
-
-    def disturbed(self, sensing: SensingConfig) -> SensingConfig:
-        """Return the settings of a sensor with the axes of the sensor applied.
+    @cached_property
+    def plant_settings(self) -> dict[str, float | str]:
+        """Settings of the plant that the axes of the sensor stand for, by dotted key.
 
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
-        return disturbed(sensing, ((axis, magnitude.size(axis)) for axis, magnitude in self.sensor))
+        axes = [(axis, magnitude.size(axis)) for axis, magnitude in self.axes if axis in SENSOR_AXES]
+        return {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
 
     @property
     def camera_exact(self) -> bool:
@@ -161,20 +159,37 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}={example}; got {text!r}")
     numbers = [float(part) for part in re.split("[:/]", match[1])]
     if ":" in match[1]:
-        begin, end, step = numbers
-        steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
-        if not steps < MAX_MAGNITUDES:
-            raise ValueError(
-                f"the range {text!r} of {axis} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps"
-            )
-        count = math.floor(max(steps, -1.0)) + 1  # none where it begins beyond its end
-        numbers = [round(begin + i * step, 9) for i in range(count)]
-    if not numbers:
-        raise ValueError(f"the range {text!r} of {axis} is empty")
+        numbers = _range(axis, text, *numbers)
     magnitudes = tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
     for magnitude in magnitudes:
-        Mismatch("", ((axis, magnitude),))  # which refuses one that is out of bounds
+        Mismatch("", ((axis, magnitude),))  # refuses a magnitude that is out of bounds
     return magnitudes
+
+
+def parse_range(name: str, text: str) -> list[float] | list[int]:
+    """Return the numbers of `begin:end:step`, both ends included; whole ones where all three are.
+
+    Args:
+        name: of that which has these values, for messages.
+        text: such as "0:0.2:0.05".
+
+    Raises:
+        ValueError: no such range, or an empty one.
+    """
+    try:
+        numbers = _range(name, text, *(float(part) for part in text.split(":")))
+        return [int(number) for number in numbers] if all(map(str.isdigit, text.split(":"))) else numbers
+    except (TypeError, OverflowError) as error:
+        raise ValueError(f"the range {text!r} of {name} must be begin:end:step") from error
+
+
+def _range(name: str, text: str, begin: float, end: float, step: float) -> list[float]:
+    steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
+    if not steps < MAX_MAGNITUDES:
+        raise ValueError(f"the range {text!r} of {name} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
+    if steps < 0.0:  # it begins beyond its end
+        raise ValueError(f"the range {text!r} of {name} is empty")
+    return [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
 
 
 @dataclass(frozen=True)

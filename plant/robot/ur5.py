@@ -13,7 +13,7 @@ import numpy as np
 
 from servobench.plant.robot.arm import SerialArm, arm_from_dh
 
-UR5 = "ur5"  # the name of the robot, by which it is found
+UR5 = "ur5"  # name of the robot in the catalogue
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 # Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i): lengths in m, angles in rad.

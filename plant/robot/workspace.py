@@ -96,8 +96,8 @@ BoolArray = npt.NDArray[np.bool_]
 HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
 OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
-BUILT_IN: Final = 0.4  # share of random postures from which on two tubes are built into each other
-IMAGE_SHARE: Final = 0.8  # of the image's half sides in which the ball stays: a margin for a camera that is turned
+BUILT_IN: Final = 0.4  # share of random postures with overlap above which two tubes count as built into each other
+IMAGE_SHARE: Final = 0.8  # share of the image's half sides for the ball, with a margin for a turned camera
 MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian; of a UR5
 STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
 CAMERA: Final = PinholeCamera()
@@ -246,19 +246,19 @@ MOVES: Final = {
     "exp4": ((0.12, -0.55, 0.50), (0.55, 0.05, 0.25)),
 }
 
-STARTS: Final = 512  # of the search for a home
+STARTS: Final = 512  # starts of the search for a home
 CANDIDATES: Final = 12  # homes whose surroundings are sampled
 WINDING: Final = 0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
-NEIGHBOURS: Final = 192  # postures that say how fit a box is
-NEAR_STARTS: Final = 96  # of the search for a posture near the home
+NEIGHBOURS: Final = 192  # sampled postures in a box
+NEAR_STARTS: Final = 96  # starts of the search for a posture near the home
 NEAR: Final = 0.4  # [rad] deviation of those starts from the home
 HALF_BOX: Final = 0.6  # [rad] half sides of the box
 LAST_HALF: Final = 0.3  # [rad] half side for the last joint, which moves the ball little
-SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)  # of the box until enough postures in it are fit
+SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)  # factors on the box until enough postures in it are fit
 ENOUGH: Final = 0.7  # share of fit postures in a box
-WAYS: Final = 24  # starts of a move that are tried
-WAY_STEPS: Final = 40  # of the way of a move
-WITHDRAWALS: Final = 8  # steps of a tenth towards the home for a place that no fit posture reaches
+WAYS: Final = 24  # number of starts that are tried for a move
+WAY_STEPS: Final = 40  # steps on the path of a move
+WITHDRAWALS: Final = 8  # steps of a tenth towards the home if no fit posture reaches a position
 
 
 def length_scale(arm: SerialArm) -> float:

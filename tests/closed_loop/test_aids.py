@@ -15,7 +15,7 @@ IDENTIFYING = [name for name in METHODS if not name.endswith(":published") and n
 
 
 def row(controller, task, mismatch, seed, *settings, latency=None):
-    request = RunRequest("kinematic", controller, task, mismatch, seed, latency=latency)
+    request = RunRequest("kinematic", controller, task, mismatch, seed, {} if latency is None else {"latency": latency})
     return run_experiment(request, read_settings(None, settings)).row
 
 

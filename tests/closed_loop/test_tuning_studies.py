@@ -13,7 +13,6 @@ from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, r
 from servobench import controllers
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.campaign import (
     StudyRecord,
     TuningPlan,
@@ -133,27 +132,12 @@ def test_a_campaign_taken_up_again_is_that_which_was_never_interrupted(made_up, 
     assert len(made_up) <= 2 * once + 1  # at most the point that was under way is scored twice
 
 
-def test_known_points_are_scored_once_for_all_studies_of_a_method(made_up, tmp_path):
-    known = len(first_points("rls"))
-    (method,) = carried_out(tmp_path, plan_of("rls", trials=known, studies=3))
-    assert len(method.ledger) == known
-    assert len(made_up) == known + len({str(point) for point in method.chosen()})
-    assert len({len(runs) for runs in (SMALL.runs(), SMALL.second().runs())} & {count for _, count, _ in made_up}) == 2
-
-
 def test_each_study_has_a_sampler_of_its_own_that_the_seed_decides(made_up, tmp_path):
     trials = len(first_points("rls")) + 3
     (method,) = carried_out(tmp_path / "a", plan_of("rls", trials=trials, studies=2))
     assert len(method.ledger) == trials + 3
     second = outcomes(tmp_path / "b", plan_of("rls", trials=trials, study_seed=1))[0]
     assert second == [method.studies[1].outcome]
-
-
-def test_a_longer_study_begins_with_the_trials_of_the_shorter_one(made_up, tmp_path):
-    carried_out(tmp_path, plan_of("rls", trials=8))
-    made_up.clear()
-    carried_out(tmp_path, plan_of("rls", trials=11))
-    assert len([count for _, count, _ in made_up if count == len(SMALL.runs())]) == 3
 
 
 def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_out(made_up, tmp_path):
@@ -225,13 +209,6 @@ def test_a_ledger_of_other_runs_is_refused_and_no_other_is_begun(made_up, tmp_pa
     assert not (tmp_path / "broyden.jsonl").exists()
 
 
-def test_a_ledger_of_another_objective_is_refused(made_up, tmp_path, monkeypatch):
-    carried_out(tmp_path, plan_of("rls"))
-    monkeypatch.setattr(objective, "ERROR_SCALE", 0.1)
-    with pytest.raises(ConfigurationError, match="was made with other objective; name another folder"):
-        open_methods(tmp_path, plan_of("rls"))
-
-
 @pytest.mark.parametrize("text", ["hello\nworld\n", "[]\n", '{"a": 1}\n{"b": 2}\n'])
 def test_a_file_that_is_no_ledger_is_refused_and_left_alone(tmp_path, text):
     (tmp_path / "rls.jsonl").write_text(text)
@@ -257,14 +234,6 @@ def test_a_ledger_forgets_half_a_line_and_goes_on(tmp_path):
 def test_a_ledger_that_cannot_be_written_says_so(tmp_path):
     with pytest.raises(ConfigurationError, match="rls.jsonl cannot be written"):
         Ledger(tmp_path / "none" / "rls.jsonl", {}).add({}, [0.0])
-
-
-@pytest.mark.parametrize("text", ["score = \n", "score = 1.0\n", "plants = []\nstudies = []\n"])
-def test_a_malformed_file_of_tuned_values_is_refused(tmp_path, text):
-    path = tmp_path / "rls.toml"
-    path.write_text(text)
-    with pytest.raises(ConfigurationError, match="rls.toml cannot be read"):
-        read_tuned(path)
 
 
 @pytest.mark.parametrize("studies", [0, 2])

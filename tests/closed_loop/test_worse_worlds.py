@@ -52,7 +52,9 @@ def test_methods_settle_as_soon_as_they_did(world, controller):
     mismatch, latency, duration, wanted = WORLDS[world]
     settings, came = Settings({"random": {"duration": duration}}), []
     for seed in SEEDS:
-        request = RunRequest("kinematic", controller, "random", mismatch, seed, latency=latency)
+        request = RunRequest(
+            "kinematic", controller, "random", mismatch, seed, {} if latency is None else {"latency": latency}
+        )
         came.append(run_experiment(request, settings, steps=False).row["settling_time_s"])
     one_period = 1.001 * RunSettings().period
     assert came == pytest.approx(wanted[METHODS.index(controller)], abs=one_period, rel=0, nan_ok=True)

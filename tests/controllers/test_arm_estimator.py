@@ -15,7 +15,6 @@ from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmSt
 from servobench.controllers.estimators.estimator import Motion
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import stack, take
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
@@ -145,29 +144,3 @@ def test_a_covariance_that_is_not_positive_definite_is_a_named_fault() -> None:
     state = arm.start(nominal_ur5().jacobian(path[0]))
     with pytest.raises(FilterDiverged, match="covariance is not"):
         arm.update(state._replace(P=-state.P), motions(path)[0])
-
-
-def test_the_sensitivity_is_the_derivative_of_the_predicted_motion() -> None:
-    q0, q1, step = np.array(TRAINING_LOWER) + 0.2, np.array(TRAINING_LOWER) + 0.5, 1e-6
-    model = nominal_ur5()
-
-    def moved(g: FloatArray, offset: FloatArray) -> FloatArray:
-        return np.asarray(model.feature(g * q1 + offset) - model.feature(g * q0 + offset))
-
-    one, none = np.ones(6), np.zeros(6)
-    first, last = model.jacobian(q0), model.jacobian(q1)
-    for i, unit in enumerate(np.eye(6)):
-        by_gear = (moved(one + step * unit, none) - moved(one - step * unit, none)) / (2 * step)
-        by_offset = (moved(one, step * unit) - moved(one, -step * unit)) / (2 * step)
-        np.testing.assert_allclose(last[:, i] * q1[i] - first[:, i] * q0[i], by_gear, atol=1e-8)
-        np.testing.assert_allclose(last[:, i] - first[:, i], by_offset, atol=1e-8)
-
-
-def test_lanes_are_bit_equal_to_single_runs() -> None:
-    arm, paths = estimator(), [walk(seed, 60) for seed in (4, 5, 6)]
-    alone = [learned(arm, path) for path in paths]
-    state = arm.start(np.stack([nominal_ur5().jacobian(path[0]) for path in paths]))
-    for together in zip(*map(motions, paths), strict=True):
-        state = arm.update(state, stack(together))
-    for lane, single in enumerate(alone):
-        np.testing.assert_equal(take(state, lane), single)

@@ -8,7 +8,7 @@ import pytest
 from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, M, N, networks
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
-from servobench.controllers.initial import InitialConfig
+from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.methods import METHODS, compose
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.signals import trusted_observation

@@ -17,7 +17,7 @@ from servobench.controllers import nmpc_calibrated
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.ukf import UkfConfig
-from servobench.controllers.initial import InitialConfig
+from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.methods import METHODS, PUBLISHED, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
 from servobench.controllers.networks.fit import train

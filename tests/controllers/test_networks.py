@@ -10,7 +10,6 @@ from servobench.controllers.networks.rbf import (
     ControllerNetwork,
     FeatureMemo,
     JacobianNetwork,
-    controller_output,
     hidden_features,
     information_vector,
     jacobian_features,
@@ -90,13 +89,6 @@ def test_the_memo_returns_the_features_of_the_given_position():
             np.testing.assert_array_equal(memo.jacobian(rows, q), network.jacobian(q, rows))
 
 
-def test_many_joint_positions_at_once_give_what_each_gives_alone():
-    network, q = jacobian_network(), np.random.default_rng(1).normal(size=(4, 2, 3))
-    together = network.jacobian(q)
-    assert together.shape == (4, 2, 2, 3)
-    np.testing.assert_allclose(together[3, 1], network.jacobian(q[3, 1]), atol=1e-14)
-
-
 @pytest.mark.parametrize(("kernel", "power"), [("exponential", 1), ("gaussian", 2)])
 def test_the_controller_equals_a_plain_loop_with_the_norm_squared_only_on_request(kernel, power):
     network, xi = controller_network(kernel=kernel), np.random.default_rng(2).normal(size=7)
@@ -124,12 +116,6 @@ def test_features_lie_between_zero_and_one_at_any_distance(n, m, scale):
     assert ((h > 0.0) & (h <= 1.0)).all()
     assert network.jacobian(q).shape == (m, n)
     assert (controller.n, controller.m) == (n, m)
-
-
-def test_a_batch_of_commands_equals_single_commands():
-    network, xi = controller_network(), np.random.default_rng(3).normal(size=(6, 7))
-    h = network.features(xi)
-    np.testing.assert_allclose(controller_output(network.weights, xi, h)[4], network.command(xi[4]), atol=1e-14)
 
 
 def test_networks_are_read_only():

@@ -9,7 +9,7 @@ from kit.toy import Recorded, Recorder, plant_spec, seen
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
-from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw

@@ -222,7 +222,7 @@ def test_no_study_uses_a_seed_that_methods_were_tuned_on():
 
 
 def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch, tmp_path, capsys):
-    short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1")
+    short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1", "--division", "equipped")
     assert servobench(monkeypatch, *short, "--out", str(tmp_path / "first")) == 0
     shown = capsys.readouterr().out
     assert "1: converges faster than the other three on kinematic, best equipped" in shown

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
 import pytest
-from fmpy import extract, read_model_description
-from fmpy.fmi2 import FMU2Slave
-from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
+from kit.fmpy_instance import Driven
 from servobench.fmus.inspection import validate_fmu
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run import export as controller_fmu
@@ -27,65 +24,31 @@ METHODS = ["ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "m
 INPUTS = 0  # value reference of the first input
 
 
-class Loaded:
-    """A controller as FMPy has it, with all inputs and all outputs at once."""
+class Loaded(Driven):
+    """A controller with all its inputs and all its outputs at once."""
 
     def __init__(self, name: str, version: int) -> None:
-        path = exported(name, version)
-        self.folder, self.version = extract(str(path)), version
-        description = read_model_description(str(path))
-        variables = {variable.name: variable.valueReference for variable in description.modelVariables}
-        command = variables["joint_velocity_command" if version == 3 else "joint_velocity_command[1]"]
-        self.inputs, self.outputs = list(range(command)), list(range(command, command + N))
-        names = ("joint_position", "feature", "seen", "reference")
-        self.arrays = [variables[name] for name in names] if version == 3 else []
-        kind = FMU3Slave if version == 3 else FMU2Slave
-        self.fmu = kind(
-            guid=description.guid,
-            unzipDirectory=self.folder,
-            modelIdentifier=description.coSimulation.modelIdentifier,
-            instanceName="controller",
-        )
-        self.fmu.instantiate()
-        self.begin()
-
-    def begin(self, stop: float | None = None) -> None:
-        if self.version == 2:
-            self.fmu.setupExperiment(startTime=0.0, stopTime=stop)
-            self.fmu.enterInitializationMode()
-        else:
-            self.fmu.enterInitializationMode(startTime=0.0, stopTime=stop)
-        self.fmu.exitInitializationMode()
+        super().__init__(exported(name, version), version)
+        self.outputs = self.references("joint_velocity_command")
+        self.start()
 
     def set(self, values) -> None:
-        if self.version == 2:
-            self.fmu.setReal(self.inputs, values.tolist())
-        else:
-            self.fmu.setFloat64(self.arrays, values.tolist())
+        self.write(values, "joint_position", "feature", "seen", "reference")
 
     def get(self) -> np.ndarray:
-        if self.version == 2:
-            return np.array(self.fmu.getReal(self.outputs))
-        return np.array(self.fmu.getFloat64([self.outputs[0]], N))
-
-    def step(self, time: float, size: float = PERIOD) -> None:
-        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
+        return self.read(N, "joint_velocity_command")
 
     def answer(self, k: int, values) -> np.ndarray:
         self.set(values)
-        self.step(k * PERIOD)
+        self.step(k * PERIOD, PERIOD)
         return self.get()
 
 
 @contextmanager
 def loaded(name: str, version: int) -> Iterator[Loaded]:
-    controller = Loaded(name, version)
-    try:
+    with Loaded(name, version) as controller:
         yield controller
-    finally:
         controller.fmu.terminate()
-        controller.fmu.freeInstance()
-        shutil.rmtree(controller.folder)
 
 
 @cache
@@ -130,7 +93,7 @@ def test_outputs_follow_inputs_at_once_and_hold_until_the_next_ones(version):
             controller.get()  # is tried and changes nothing
             controller.set(inputs[k])
             np.testing.assert_allclose(controller.get(), commands[k], rtol=0, atol=1e-12)
-            controller.step(k * PERIOD)
+            controller.step(k * PERIOD, PERIOD)
             np.testing.assert_allclose(controller.get(), commands[k], rtol=0, atol=1e-12)
 
 
@@ -173,7 +136,7 @@ def test_a_saved_state_goes_on_with_equal_bits_and_reset_begins_anew(version):
         np.testing.assert_array_equal([controller.answer(k, inputs[k]) for k in range(30, PERIODS)], after)
         (fmu.freeFMUstate if version == 2 else fmu.freeFMUState)(state)
         fmu.reset()
-        controller.begin()
+        controller.start()
         np.testing.assert_array_equal([controller.answer(k, inputs[k]) for k in range(30)], before)
 
 

@@ -13,7 +13,7 @@ import pytest
 import generated_tables
 from kit.documents import names, read, section, tables
 from servobench.controllers.aids import EQUIPPED, AidsConfig
-from servobench.controllers.initial import InitialConfig
+from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry

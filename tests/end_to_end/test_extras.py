@@ -37,7 +37,7 @@ finally:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("arguments", [("--help",), ("compare", "--help"), ("fmu", "--help"), ("record", "--help")])
+@pytest.mark.parametrize("arguments", [("--help",), ("compare", "--help")])
 def test_a_help_text_imports_nothing_heavy(tmp_path, arguments):
     modules = set(HEAVY) if len(arguments) == 1 else set(HEAVY) - {"pydantic"}  # with which typer reads options
     loaded = f"sys.stderr.write(' '.join(sorted(set(sys.modules) & {modules!r})))"
@@ -70,9 +70,7 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
             marks=NEEDS_BULLET,
         ),
         ("pybullet", "bullet", ("run", "--plant", "bullet")),
-        ("pybullet", "bullet", ("compare", "--plants", "kinematic,bullet")),
         ("mujoco", "mujoco", ("run", "--plant", "mujoco")),
-        ("mujoco", "mujoco", ("compare", "--plants", "kinematic,mujoco")),
     ],
 )
 def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module, extra, arguments):

@@ -19,9 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kit.plants import mismatched, nominal_ur5, setup
-from servobench.fmus import compile as compiling
+from servobench.fmus import compiler as compiling
 from servobench.fmus import export
-from servobench.fmus.compile import (
+from servobench.fmus.compiler import (
     PLATFORMS,
     CompilationFailed,
     CompilerMissing,
@@ -112,7 +112,7 @@ def test_the_fingerprint_changes_with_whatever_decides_how_the_fmu_behaves(monke
 EXPORT = """
 import sys
 from pathlib import Path
-from servobench.fmus.compile import parse_platforms
+from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.export import ExportOptions, export_fmu
 export_fmu(Path("again.fmu"), ExportOptions(int(sys.argv[1]), platforms=parse_platforms(sys.argv[2])))
 """

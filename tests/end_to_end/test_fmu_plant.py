@@ -14,7 +14,7 @@ import pytest
 
 from kit.foreign_fmu import build_crane, describe_with
 from kit.plants import nominal_ur5
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup

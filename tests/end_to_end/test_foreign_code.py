@@ -11,7 +11,7 @@ import pytest
 
 from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import Job

@@ -87,7 +87,6 @@ def plugin(tmp_path) -> Path:
         ("compare", "exit", "1"),
         ("sweep", "build", "2"),
         ("sweep", "close", "1"),
-        ("sweep", "hang", "1"),
         ("tune", "exit", "2"),
         ("tune", "hang", "1"),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -17,7 +16,7 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, engines, held_out, physical, readme, side_by_side, worlds
+from page_studies import STUDIES, held_out, physical, readme, side_by_side, worlds
 from page_studies.study import Study, nothing, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING, parse_seeds
@@ -203,30 +202,6 @@ def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path
             assert f"<!-- table: {name} -->" in shown or f"<!-- stored: {name} -->" in shown
 
 
-def test_losses_at_a_faster_rate_are_those_beyond_the_paired_interval():
-    def runs(*times):
-        return pd.DataFrame({
-            "plant": "kinematic", "task": "random", "seed": range(len(times)), "status": "completed",
-            "settling_time_s": times,
-        })  # fmt: skip
-
-    slow = runs(*[1.0] * 10)
-    assert physical.loss(slow, runs(*[0.8] * 10)) == ""
-    assert physical.loss(slow, runs(*[1.2] * 4, *[0.8] * 6)) == ""
-    assert "+0.20 [+0.20, +0.20]" in physical.loss(slow, runs(*[1.2] * 10))
-    assert "4 fewer settle, 0 more" in physical.loss(slow, runs(*[math.nan] * 4, *[1.0] * 6))
-    assert physical.loss(slow, runs(*[math.nan] * 2, *[1.0] * 8)) == ""
-
-
-def test_nested_settings_become_assignments():
-    values = {"law": {"gain": 2.5, "mode": "moves"}, "aids": {"filter": True}}
-    assert list(held_out.assignments("ukf_mpc:published", values)) == [
-        "ukf_mpc:published.law.gain=2.5", 'ukf_mpc:published.law.mode="moves"', "ukf_mpc:published.aids.filter=true",
-    ]  # fmt: skip
-    read = read_settings(None, list(held_out.assignments("ukf_mpc:published", values)))
-    assert read.sections == {"ukf_mpc:published": values}
-
-
 def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
     short = (
         "compare", "--plants", "kinematic", "--controllers", "calibrated", "--tasks", "exp2,circle", "--mismatch",
@@ -300,42 +275,6 @@ def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
     barely = runs(usual=1.0, changed=1.07 + spread)
     hardly = runs(usual=1.0, changed=1.04 + 0.2 * np.cos(5 * robots))
     assert not bold(barely, hardly)  # one interval leaves 0 out and the other does not, but they differ by chance
-
-
-def test_what_is_worse_at_a_faster_rate_on_one_engine_only_is_in_bold(monkeypatch, tmp_path):
-    def runs(plant):
-        late = plant == "bullet"
-        return pd.DataFrame([
-            {
-                "plant": plant, "task": "random", "controller": "pid", "seed": seed, "status": "completed",
-                "period_s": 1.0 / rate, "settling_time_s": 2.0 if late and rate == 250 else 1.0,
-            }
-            for rate, seed in product(physical.RATES, range(10))
-        ])  # fmt: skip
-
-    monkeypatch.setattr(physical, "load_runs", lambda path: runs(path.name))
-    worse = physical.rates_table(tmp_path)["rates"].set_index("plant")["worse"]
-    assert worse["kinematic"] == "nowhere"
-    assert worse["bullet"].startswith("**250 Hz: +1.00")
-    assert worse["mujoco"] == "**nowhere**"
-
-
-def test_an_axis_of_the_map_along_which_one_engine_loses_robots_is_in_bold(monkeypatch, tmp_path):
-    lost = {("mujoco", "b", 60.0), ("mujoco", "b", 90.0)}
-    runs = pd.DataFrame([
-        {
-            "axis": "camera_rotation", "plant": plant, "controller": name, "magnitude": magnitude, "seed": seed,
-            "status": "completed",
-            "settling_time_s": math.nan if (plant, name, magnitude) in lost else 1.0,
-        }
-        for plant, name, magnitude, seed in product(side_by_side.ENGINES, "ab", (0.0, 60.0, 90.0), range(5))
-    ])  # fmt: skip
-    monkeypatch.setattr(engines, "load_runs", lambda path: runs[runs["plant"] == path.name])
-    rows = engines.map_tables(tmp_path)["robustness_engines"].to_dict("records")
-    assert [(row["plant"], row["`a`"], row["`b`"]) for row in rows] == [
-        ("bullet", "5 5 5", "**5 5 5**"), ("mujoco", "5 5 5", "**5 0 0**"),
-    ]  # fmt: skip
-    assert rows[0]["axis"] == "camera turned [°]: 0, 30, 60, 90, 120, 150, 180"
 
 
 def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):

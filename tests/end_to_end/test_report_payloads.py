@@ -90,10 +90,10 @@ def harmless(tmp_path_factory) -> Tags:
     return Tags(page_with("harmless", tmp_path_factory.mktemp("harmless") / "out"))
 
 
-@pytest.mark.parametrize("payload", PAYLOADS)
-def test_a_payload_in_every_text_of_a_folder_stays_a_text(harmless, tmp_path, payload):
-    page = Tags(page_with(payload, tmp_path / "out"))
+@pytest.mark.parametrize("payloads", [PAYLOADS[k::5] for k in range(5)], ids=range(5))
+def test_payloads_in_every_text_of_a_folder_stay_texts(harmless, tmp_path, payloads):
+    page = Tags(page_with(" ".join(payloads), tmp_path / "out"))
     assert page.tags == harmless.tags
     assert page.others == harmless.others
-    shown = "".join(page.words)
-    assert re.sub(r"[\s`\x00]", "", payload) in re.sub(r"[\s`\x00\ufffd]", "", shown)
+    shown = re.sub(r"[\s`\x00\ufffd]", "", "".join(page.words))
+    assert [each for each in payloads if re.sub(r"[\s`\x00]", "", each) not in shown] == []

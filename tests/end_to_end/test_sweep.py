@@ -12,7 +12,7 @@ import pytest
 from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import CHUNK
-from servobench.harness.batch.plan import Batch, SweepPlan, parse_variation
+from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 
@@ -100,6 +100,23 @@ def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single
     )
 
 
+def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(monkeypatch, capsys, tmp_path):
+    out, alone = tmp_path / "varied", tmp_path / "alone"
+    common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
+    varied = ("--vary", "kinematic.lag=0.02,0.1", "--vary", "plant.sensing.noise=white,uniform")
+    assert servobench(monkeypatch, *common, *varied, "--out", str(out)) == 0
+    assert "plant.lag" in capsys.readouterr().out
+    single = ("--set", "kinematic.lag=0.1", "--set", "kinematic.sensing.noise=uniform")
+    assert servobench(monkeypatch, *common, *single, "--out", str(alone)) == 0
+    table, last = judged(results.load_runs(out)), judged(results.load_runs(alone))
+    assert table["plant.lag"].tolist() == [0.02] * 4 + [0.1] * 4
+    assert table["plant.sensing.noise"].tolist() == ["white", "white", "uniform", "uniform"] * 2
+    own = ["run_id", "plant.lag", "plant.sensing.noise"]
+    pd.testing.assert_frame_equal(
+        table.iloc[6:].drop(columns=own).reset_index(drop=True), last.drop(columns="run_id"), check_exact=True
+    )
+
+
 def test_ctrl_c_keeps_what_is_finished(tmp_path):
     out = tmp_path / "stopped"
     process = start(*SWEEP, "--out", str(out))
@@ -123,11 +140,11 @@ def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(undisturbed
 
 def test_variations_are_put_on_top_of_the_mismatch_one_by_one():
     batch = Batch(("kinematic",), ("constant",), ("random",), ("none", "moderate"), (0, 1))
-    plan = SweepPlan(batch, (parse_variation("links=10/20%"), parse_variation("tool=5mm")), (1.0,), (None, 2))
+    plan = SweepPlan.parse(batch, ("links=10/20%", "tool=5mm", "latency=0,2"))
     cells = plan.cells()
     assert len(cells) == 3 * 2 * 2 * 2
     assert {str(cell.request.mismatch) for cell in cells} == {
         "links=10%", "moderate+links=10%", "links=20%", "moderate+links=20%", "tool=5mm", "moderate+tool=5mm",
     }  # fmt: skip
     with pytest.raises(ConfigurationError, match="--vary: unknown mismatch axis"):
-        parse_variation("zoom=1:2:1")
+        SweepPlan.parse(batch, ["zoom=1:2:1"])

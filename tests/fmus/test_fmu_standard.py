@@ -9,65 +9,31 @@ import numpy as np
 import pytest
 from fmpy import read_model_description, simulate_fmu
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import FMU2Model, FMU2Slave
-from fmpy.fmi3 import FMU3Model, FMU3Slave
 from fmpy.model_description import read_build_description
 
+from kit.fmpy_instance import Driven
 from servobench.fmus.export import arm_layout
 from servobench.fmus.ur5_plant import cached_fmu
-from servobench.plant.fmu.archive import extract_fmu
 
 VERSIONS = [2, 3]
 LAYOUT = arm_layout(6)
 
 
-class Fmu:
-    """An instance of the exported FMU as fmpy drives it."""
+class Fmu(Driven):
+    """The exported UR5."""
 
     def __init__(self, version: int, exchange: bool = False) -> None:
-        self.version, self.exchange = version, exchange
-        path = cached_fmu(version)
-        self.description = read_model_description(str(path))
-        kinds = {(2, False): FMU2Slave, (2, True): FMU2Model, (3, False): FMU3Slave, (3, True): FMU3Model}
-        token = self.description.guid if version == 2 else self.description.instantiationToken
-        self.fmu = kinds[version, exchange](
-            guid=token,
-            unzipDirectory=str(extract_fmu(path)),
-            modelIdentifier="ur5_mismatched",
-            instanceName="arm",
-        )
-        self.fmu.instantiate()
+        super().__init__(cached_fmu(version), version, exchange=exchange)
 
-    def start(self, time: float = 0.0, stop: float | None = None) -> None:
-        if self.version == 2:
-            self.fmu.setupExperiment(startTime=time, stopTime=stop)
-            self.fmu.enterInitializationMode()
-        else:
-            self.fmu.enterInitializationMode(startTime=time, stopTime=stop)
-        self.fmu.exitInitializationMode()
-
-    def step(self, time: float, size: float) -> None:
-        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
-
-    def references(self, name: str) -> list[int]:
-        first, size = LAYOUT.offsets[name], next(group.size for group in LAYOUT.groups if group.name == name)
-        return list(range(first, first + size)) if self.version == 2 else [first]
-
-    def set(self, name: str, value: float, size: int = 6) -> None:
-        write = self.fmu.setReal if self.version == 2 else self.fmu.setFloat64
-        write(self.references(name), [value] * size)
+    def set(self, name: str, value: float) -> None:
+        self.write([value] * sizes([name])[0], name)
 
     def get(self, name: str) -> np.ndarray:
-        if self.version == 2:
-            return np.array(self.fmu.getReal(self.references(name)))
-        size = next(group.size for group in LAYOUT.groups if group.name == name)
-        return np.array(self.fmu.getFloat64(self.references(name), nValues=size))
+        return self.read(sizes([name])[0], name)
 
-    def __enter__(self):
-        return self
 
-    def __exit__(self, *_) -> None:
-        self.fmu.freeInstance()
+def sizes(names) -> list[int]:
+    return [next(group.size for group in LAYOUT.groups if group.name == name) for name in names]
 
 
 def refused():
@@ -234,10 +200,6 @@ UNKNOWNS = (
     "der(joint_velocity)",
     "stop_indicator",
 )
-
-
-def sizes(names) -> list[int]:
-    return [next(group.size for group in LAYOUT.groups if group.name == name) for name in names]
 
 
 @pytest.mark.parametrize("starting", [True, False])

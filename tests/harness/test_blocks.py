@@ -16,7 +16,7 @@ from kit.command import judged
 from servobench.harness.batch import blocks, results
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
-from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, parse_variation, survey
+from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.sandbox import Answer, End, Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import identity
@@ -24,9 +24,9 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
 
-PLAN = SweepPlan(
+PLAN = SweepPlan.parse(
     Batch(("kinematic",), ("constant", "broyden"), ("random",), ("moderate",), range(6)),
-    (parse_variation("camera_rotation=0:40:40deg"),),
+    ("camera_rotation=0:40:40deg",),
 )
 CAMPAIGN = Campaign(PLAN.cells(), Settings({"random": {"duration": 0.5}}))
 SEED_OF_A_CRASH = 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from itertools import product
@@ -10,12 +11,15 @@ import numpy as np
 import pytest
 
 from kit.command import servobench
+from servobench.controllers.aids import AidsConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.description import configuration_file, describe_settings
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
 from servobench.harness.run import resolution as resolved
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.run.tasks import TASKS
 
@@ -90,3 +94,38 @@ def test_settings_of_a_plant_that_cannot_run_here_can_be_written(monkeypatch):
     assert "bullet" in sections(("bullet",), ("constant",), ("exp2",))
     with pytest.raises(ConfigurationError, match="plant 'bullet' needs a_package_that_is_not_there"):
         resolve_sections([RunRequest("bullet", "constant", "exp2", "none", 0)], Settings())
+
+
+BOUND = re.compile(r"(≥|>|≤|<) ([\d.e+-]+)")
+BEYOND = {"≥": -1.0, ">": 0.0, "≤": 1.0, "<": 0.0}  # from a bound to a value that it rules out
+CONFIGS = {name: entry.config() for name, entry in (*ESTIMATORS.items(), *LAWS.items())}
+CONFIGS |= {name: registry.find_plant(name).config() for name in PLANTS}
+CONFIGS |= {name: entry.default for name, entry in TASKS.items()}
+CONFIGS |= {"aids": AidsConfig(), "initial": InitialConfig(), "run": RunSettings()}
+CONFIGS |= {name: registry.find_controller(name).config() for name in ("rbfnn_mfac", "nmpc_calibrated")}
+
+
+def ruled_out(setting):
+    """Yield values that the words of a setting do not allow."""
+    for sign, number in BOUND.findall(setting.allowed):
+        value = float(number) + BEYOND[sign]
+        value = int(value) if "whole" in setting.allowed else value
+        yield [value] * max(len(setting.value or ()), 1) if "each" in setting.allowed else value
+    if setting.allowed.startswith('"'):
+        yield "nonsense"
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_no_setting_takes_a_value_that_its_words_rule_out(name):
+    for setting in describe_settings(CONFIGS[name]):
+        for value in ruled_out(setting):
+            values = value
+            for part in reversed(setting.key.split(".")):
+                values = {part: values}
+            with pytest.raises(ConfigurationError, match=rf"{name}\.{setting.key}(\.\d+)* must be [^\n]*$"):
+                Settings({name: values}).resolve(name, CONFIGS[name])
+
+
+def test_most_settings_have_a_bound():
+    settings = [setting for config in CONFIGS.values() for setting in describe_settings(config)]
+    assert sum(any(True for _ in ruled_out(setting)) for setting in settings) > 0.7 * len(settings) > 250

@@ -35,7 +35,7 @@ STARTS = np.array(HOME) + np.random.default_rng(0).uniform(-0.3, 0.3, (LANES, 6)
 MAX_PERIODS = 200
 COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (MAX_PERIODS, LANES, 6))
 SENSING = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3, "outliers": 0.2}
-FEW = settings(max_examples=6, stateful_step_count=25, deadline=None)
+FEW = settings(max_examples=4, stateful_step_count=25, deadline=None)
 
 
 def bits(*arrays) -> bytes:

@@ -7,14 +7,17 @@ import pytest
 from kit.plants import NEEDS_BULLET
 from servobench.harness.config.registry import controller_names, engine_of
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.mismatch import Mismatch
 
 
 @pytest.mark.parametrize("controller", [*controller_names(), "mfac+rls"])
 def test_a_resolved_run_can_be_sent_to_another_process(controller):
-    run = resolve(RunRequest("kinematic", controller, "circle", Mismatch("moderate"), 3, 2.0, 0.05), Settings())
+    run = resolve(
+        RunRequest("kinematic", controller, "circle", Mismatch("moderate"), 3, {"noise": 2.0, "latency": 0.05}),
+        Settings(),
+    )
     again = pickle.loads(pickle.dumps(run))
     assert (again.request, again.run, again.plant, again.task) == (run.request, run.run, run.plant, run.task)
     assert repr(again.controller) == repr(run.controller)
@@ -23,7 +26,9 @@ def test_a_resolved_run_can_be_sent_to_another_process(controller):
 def test_a_resolved_run_holds_what_the_user_set_and_what_the_request_varies():
     law = {"law": {"gain": 4.0}}
     settings = Settings({"run": {"preview_time": 0.15}, "circle": {"laps": 1}, "ukf_mfac": law})
-    run = resolve(RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, latency=0.1, period=0.02), settings)
+    run = resolve(
+        RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, {"latency": 0.1, "period": 0.02}), settings
+    )
     assert run.run == RunSettings(0.02, 0.15)
     assert run.task.laps == 1
     assert run.controller.law.gain == 4.0
@@ -54,3 +59,15 @@ def test_a_row_names_the_engine_that_renders_its_plant(plant, engine):
     told = engine_of(plant)
     assert told.startswith(engine)
     assert bool(told) == bool(engine)
+
+
+def test_varied_settings_are_columns_from_which_they_are_read_again():
+    varied = {"task.radius": 0.1, "mfac.law.gain": 2, "noise": 2, "period": 0.02, "plant.obstacles": [[1.0, 2.0]]}
+    request = RunRequest("bullet", "mfac", "circle", "none", 0, varied)
+    row = request.as_row()
+    assert (row["noise_factor"], row["latency_s"], row["period_s"]) == (2.0, None, 0.02)
+    assert (row["task.radius"], row["controller.law.gain"]) == (0.1, 2)
+    assert row["run_id"].startswith("bullet-mfac-circle-none-noise2-period20ms-controller.law.gain=2-")
+    again = RunRequest("bullet", "mfac", "circle", "none", 0, varied_in_row(row))
+    assert again == request
+    assert hash(again) == hash(request)

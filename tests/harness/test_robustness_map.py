@@ -37,9 +37,10 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
     assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
     assert {cell.columns["axis"] for cell in moved} == {MOVE}
     assert {str(cell.request.mismatch) for cell in moved} >= {"moderate+camera_move=90deg"}
-    latencies = {cell.request.latency for cell in usual if cell.columns["axis"] == "latency"}
-    assert latencies == {0.0, 0.05, 0.1, 0.15, 0.2, 0.25}
-    assert {cell.request.noise_factor for cell in usual if cell.columns["axis"] == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
+    latencies = {cell.request.varied for cell in usual if cell.columns["axis"] == "latency"}
+    assert latencies == {(("plant.sensing.latency", late),) for late in (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)}
+    noise = {cell.request.varied for cell in usual if cell.columns["axis"] == "noise"}
+    assert noise == {(("plant.sensing.noise_factor", factor),) for factor in (0.0, 1.0, 2.0, 4.0, 8.0)}
 
 
 def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():

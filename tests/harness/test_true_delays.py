@@ -23,7 +23,7 @@ def knowledge_of(plant, needs_truth, settings, **request):
         return constant.build(config, knowledge)
 
     with offering([own_object(CONTROLLER, ControllerEntry("spy", "", constant.config, build, needs_truth))]):
-        run = RunRequest(plant, "spy", "exp1", "moderate", 0, **request)
+        run = RunRequest(plant, "spy", "exp1", "moderate", 0, request)
         build_experiment(run, Settings({plant: settings})).plant.close()
     return seen[0]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 from servobench.fmus.controller_export import ControllerModel
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Experiment, build

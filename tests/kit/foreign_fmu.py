@@ -16,7 +16,7 @@ import zipfile
 from functools import cache
 from pathlib import Path
 
-from servobench.fmus.compile import this_platform
+from servobench.fmus.compiler import this_platform
 
 SOURCES = Path(__file__).parent / "foreign_fmu_sources"
 STARTS = {"push": (0.0, 0.0), "arm": (0.5, 0.4)}

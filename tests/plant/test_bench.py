@@ -10,9 +10,8 @@ import pytest
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import World
 from servobench.plant.contract.faults import FeatureLost
-from servobench.plant.contract.sensing import SensingConfig, can_vary_sensing, vary_sensing
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command, PlantSpec, Truth
-from servobench.plant.kinematic import KinematicConfig
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 0.5], [-9.0, -9.0], [9.0, 9.0], 0.1)
 QUIET = SensingConfig(0.0)
@@ -121,12 +120,3 @@ def test_closing_closes_the_world():
     plant = bench()
     plant.close()
     assert plant.world.closed == 1
-
-
-def test_noise_and_latency_are_varied_in_the_section_sensing_alone():
-    config = KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 0.05))
-    varied = vary_sensing(vary_sensing(config, 2.0, None), 3.0, 0.2)
-    assert varied == KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 0.2, noise_factor=6.0))
-    assert can_vary_sensing(config)
-    with pytest.raises(ValueError, match="cannot be varied"):
-        vary_sensing(object(), 2.0, None)

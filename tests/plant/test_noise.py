@@ -193,7 +193,7 @@ def test_a_word_of_the_sensor_sets_its_setting_and_draws_no_other_robot(axis):
     example = SENSOR_AXES[axis].example
     mismatch = Mismatch.parse(f"moderate+{axis}={example}")
     assert str(mismatch) == f"moderate+{axis}={example}"
-    changed = mismatch.disturbed(SensingConfig())
+    changed = SensingConfig(**{key.removeprefix("sensing."): value for key, value in mismatch.plant_settings.items()})
     assert changed != SensingConfig()
     assert getattr(changed, SENSOR_AXES[axis].setting) == pytest.approx(mismatch.size(axis))
     assert changed.noise == (SENSOR_AXES[axis].family or "white")

@@ -9,7 +9,7 @@ from kit.plants import ALL_PLANTS, nominal_ur5
 from servobench.harness.check.plants import check_plant
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.contract.sensing import vary_sensing
+from servobench.plant.contract.settings import override
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -145,11 +145,15 @@ def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
     np.testing.assert_allclose(plant.truth().feature, before.feature, atol=1e-9)
 
 
+def with_sensor(entry, noise_factor):
+    return override("plant", entry.config(), {"sensing": {"noise_factor": noise_factor, "latency": 3 * PERIOD}})
+
+
 def test_noise_and_latency_can_be_varied(entry):
     model = nominal_ur5()
 
     def spread(factor: float) -> float:
-        plant = entry.build(vary_sensing(entry.config(), factor, 3 * PERIOD), PlantSetup(model, np.array(HOME), PERIOD))
+        plant = entry.build(with_sensor(entry, factor), PlantSetup(model, np.array(HOME), PERIOD))
         try:
             seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(30))]
             return float(np.std(seen, axis=0).max())
@@ -166,7 +170,7 @@ START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the po
 
 def test_latency_shows_a_moved_camera_late(entry):
     model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), find_robot("ur5"), 1)
-    plant = entry.build(vary_sensing(entry.config(), 0.0, 3 * PERIOD), PlantSetup(model, START, PERIOD))
+    plant = entry.build(with_sensor(entry, 0.0), PlantSetup(model, START, PERIOD))
     first = plant.reset(0).feature
     plant.move_camera(sample.moved(model, find_robot("ur5")).X_BC)
     seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]

@@ -256,14 +256,14 @@ def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
 
 
 def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
-    seven, again, eight = random_robot(7), random_robot(7), random_robot(8)
-    q = np.full(seven.n, 0.3)
-    np.testing.assert_array_equal(seven.arm.ball_position(q), again.arm.ball_position(q))
-    assert not seven.known
-    assert 3 <= seven.n <= 7
-    assert seven.n != eight.n or not np.allclose(seven.arm.translation, eight.arm.translation)
-    assert set(seven.arm.gear_ratio) <= {-1.0, 1.0}
-    assert find_robot("random_arm:7") is find_robot("random_arm:7")
+    one, again, other = find_robot("random_arm:1"), random_robot(1), random_robot(0)
+    q = np.full(one.n, 0.3)
+    np.testing.assert_array_equal(one.arm.ball_position(q), again.arm.ball_position(q))
+    assert not one.known
+    assert 3 <= one.n <= 7
+    assert one.n != other.n or not np.allclose(one.arm.translation, other.arm.translation)
+    assert set(one.arm.gear_ratio) <= {-1.0, 1.0}
+    assert find_robot("random_arm:1") is one
 
 
 @pytest.mark.parametrize("text", ["random_arm:", "random_arm:-1", "random_arm:two", "random_arm:99999999"])

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import PLATFORMS, Platform, this_platform
+from servobench.fmus.compiler import PLATFORMS, Platform, this_platform
 from servobench.fmus.product import Product
 
 HERE = Path(__file__).parent

@@ -24,7 +24,6 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -35,10 +34,10 @@ from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.lanes import side_by_side_key
-from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolution import ResolvedRun, resolve_sections, select
+from servobench.harness.run.request import RunRequest, Varied, read_mismatch
+from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
-from servobench.plant.contract.sensing import can_vary_sensing
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Periods, settings
 
 
@@ -48,16 +47,15 @@ class Condition:
 
     task: str
     latency: float  # [s] of the camera
-    noise_factor: float  # on the usual noise
+    noise_factor: float  # of the sensor
     weight: float  # of a run in the score
     command_delay: float | None = None  # [s] None for the plant's own
 
-
-@dataclass(frozen=True)
-class TuningRun(RunRequest):
-    """A run of a tuning set, still without a controller."""
-
-    command_delay: float | None = None  # [s] None for the plant's own
+    @property
+    def varied(self) -> Varied:
+        """Settings of the plant in these runs."""
+        delay = () if self.command_delay is None else (("plant.command_delay", self.command_delay),)
+        return (("noise", self.noise_factor), ("latency", self.latency), *delay)
 
 
 MOVE: Final = "random"
@@ -110,27 +108,25 @@ class TuningSet:
             raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
             entry = find_plant(name)
-            if entry.own_robot or not can_vary_sensing(entry.config()):
+            if entry.own_robot or not isinstance(getattr(entry.config(), "sensing", None), SensingConfig):
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
     def second(self) -> TuningSet:
         """Return the second, larger set: other robots of the tuning range, which no trial uses."""
         return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
 
-    def runs(self) -> list[TuningRun]:
+    def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a condition one after the other."""
         seeds = tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
         mismatches = [read_mismatch(text) for text in MISMATCHES]
         return [
-            TuningRun(
+            RunRequest(
                 plant,
                 "",
                 condition.task,
                 mismatches[robot % len(mismatches)],
                 seeds[c * self.robots + robot],
-                condition.noise_factor,
-                condition.latency,
-                command_delay=condition.command_delay,
+                condition.varied,
             )
             for plant in self.plants
             for c, condition in enumerate(CONDITIONS)
@@ -150,18 +146,11 @@ class Trial:
     controller: str
     config: Any
 
-    def resolved(self, runs: Sequence[TuningRun]) -> list[ResolvedRun]:
+    def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
-        sections = resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config}
-        chosen = [(select(request, sections), request.command_delay) for request in requests]
-        return [run if delay is None else replace(run, plant=_delayed(run.plant, delay)) for run, delay in chosen]
-
-
-@lru_cache
-def _delayed(plant: Any, command_delay: float) -> Any:  # noqa: ANN401 - any configuration dataclass
-    """Return the same object for all runs of a delay [s], so that they can advance together."""
-    return replace(plant, command_delay=command_delay)
+        sections = Sections(resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config})
+        return [select(request, sections) for request in requests]
 
 
 Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
@@ -185,7 +174,7 @@ def score(costs: Sequence[float]) -> float:
     return float(np.mean(costs))
 
 
-def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Workers) -> Iterator[Cost]:
+def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[Cost]:
     """Carry out every run of every trial and yield each cost as it is known, in any order.
 
     Args:

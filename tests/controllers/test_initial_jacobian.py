@@ -8,7 +8,7 @@ import pytest
 from kit.plants import configure, nominal_ur5
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.methods import compose
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ControllerDiverged

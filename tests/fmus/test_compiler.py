@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from servobench.fmus.compile import PLATFORMS, CompilerMissing, compile_library, library_files, this_platform
+from servobench.fmus.compiler import PLATFORMS, CompilerMissing, compile_library, library_files, this_platform
 
 SOURCE = "#ifndef ANSWER\n#error no answer\n#endif\nint answer(void) { return ANSWER; }\n"
 

@@ -75,7 +75,7 @@ def test_a_mark_that_leaves_the_image_is_lost_alone():
 
 
 def test_runs_side_by_side_have_the_numbers_of_single_ones():
-    fmu, numpy = plants("stereo", 2, seeds=(0, 1, 2))
+    fmu, numpy = plants("pixel", 2, seeds=(0, 1, 2))
     fmu.reset([5, 6, 7]), numpy.reset([5, 6, 7])
     for _ in range(3):
         u = Command(np.full((3, 6), 0.3))
