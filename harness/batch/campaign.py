@@ -16,7 +16,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from servobench.harness.batch import results
-from servobench.harness.batch.blocks import BLOCK, CHUNK, Block, Job, build_block, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import (
+    BLOCK,
+    CHUNK,
+    Block,
+    Job,
+    build_block,
+    carry_out_blocks,
+    cut,
+    even_size,
+    open_workers,
+)
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
 from servobench.harness.batch.lock import check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
@@ -24,7 +34,6 @@ from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuni
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.batch.tables import writing
-from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Assignment, ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once

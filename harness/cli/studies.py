@@ -186,8 +186,8 @@ def tune(
 
     Every method has the same budget on the same training plants.
     """
+    from servobench.harness.batch.blocks import open_workers
     from servobench.harness.batch.lock import locked
-    from servobench.harness.batch.workers import open_workers
     from servobench.harness.studies.tuning.campaign import TuningPlan, check_study_folder, open_methods, write_results
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable

@@ -14,8 +14,8 @@ import pytest
 from kit.command import PACKAGE, finish, judged, part_count, start, wait_for
 from kit.own import CONFIGURED, CONFIGURED_CELL, write
 from servobench.harness.batch import results
+from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.settings import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")

@@ -71,7 +71,7 @@ def test_an_fmu_that_the_user_trusts_shares_a_process(tmp_path, monkeypatch):
         settings = Settings({plant: {"isolate": not trusted}})
         run = resolve(RunRequest(plant, "broyden", "target", "none", 0), settings)
         assert bool(Job(0, Cell(run.request), run).owner) != trusted
-    monkeypatch.setattr("servobench.harness.batch.workers.Pool", None)  # no process can be started
+    monkeypatch.setattr("servobench.harness.batch.blocks.Pool", None)  # no process can be started
     arguments = ("--plants", plant, "--workers", "1", "--out", str(tmp_path / "out"), "--set", f"{plant}.isolate=false")
     assert servobench(monkeypatch, "sweep", *arguments, *RUN) == 0
     assert set(results.load_runs(tmp_path / "out")["status"]) == {"completed"}

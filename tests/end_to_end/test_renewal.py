@@ -24,7 +24,6 @@ from servobench.harness.config.settings import read_settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.studies import robustness
-from servobench.harness.studies import robustness as map_lines
 
 TRIED = ("--set", "random.duration=0.5")
 
@@ -219,8 +218,8 @@ def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
 
 
 def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
-    lines = replace(map_lines.LINES[4], places=map_lines.LINES[4].places[:2]), map_lines.LINES[-1]
-    monkeypatch.setattr(map_lines, "LINES", lines)
+    lines = replace(robustness.LINES[4], places=robustness.LINES[4].places[:2]), robustness.LINES[-1]
+    monkeypatch.setattr(robustness, "LINES", lines)
     monkeypatch.setattr(robustness, "KNOWN_LINES", {line.axis: line for line in lines})
     out = tmp_path / "robustness" / "map"
     arguments = (

@@ -12,8 +12,8 @@ import pytest
 
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch import processes
+from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.processes import FOREIGN_TIME, LEAST_FOREIGN_MEMORY, Bounds, Limits, read_size, show_size
-from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.registry import is_foreign_controller, is_foreign_plant
 
 

@@ -13,7 +13,6 @@ from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.studies import robustness
-from servobench.harness.studies import robustness as map_lines
 from servobench.harness.studies.robustness import (
     KNOWN_LINES,
     LATENCY,
@@ -104,7 +103,6 @@ def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_rendered_arm
 ):
     line = Line(LATENCY, "camera latency [ms]", (Magnitude(0.0, "ms"),))
     monkeypatch.setattr(robustness, "KNOWN_LINES", {LATENCY: line})
-    monkeypatch.setattr(map_lines, "KNOWN_LINES", {LATENCY: line})
     words = ("--axes", LATENCY, "--plant", plant, "--controllers", "constant", "--seeds", "1", "--workers", "1")
     assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=0.2", "--out", str(tmp_path)) == 0
     assert pd.read_csv(tmp_path / "predicted_limits.csv")["controller"].to_list() == predicted

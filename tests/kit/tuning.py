@@ -6,7 +6,7 @@ import tomllib
 
 import numpy as np
 
-from servobench.harness.batch.workers import open_workers
+from servobench.harness.batch.blocks import open_workers
 from servobench.harness.config.settings import flatten
 from servobench.harness.studies.tuning import scoring
 from servobench.harness.studies.tuning.campaign import StudyRecord, TunedValues, TuningPlan, advance, open_methods
