@@ -1,4 +1,4 @@
-"""Plans of batches: the runs of a comparison and of a sweep, made when they are needed, and which seeds are for what.
+"""Plans of batches: the runs of a comparison and of a sweep, made when they are needed, and the purposes of seeds.
 
 A run's seed decides its true robot, its task and its noise. Methods are tuned on the seeds `TUNING` and judged on all
 others, so that no method is judged by a robot on which it was tuned.
@@ -29,7 +29,7 @@ from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitude
 
 MAX_SEEDS: Final = 1_000_000  # of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
-MAX_SHOWN: Final = 200  # [characters] of what was given, in a message
+MAX_SHOWN: Final = 200  # [characters] of a given text, in a message
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 
 
@@ -128,7 +128,7 @@ def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
     """Refuse to judge methods by robots on which they were tuned.
 
     Raises:
-        ConfigurationError: names the first seed of the tuning range and says what to take instead.
+        ConfigurationError: names the first seed of the tuning range and says which to take instead.
     """
     found = [seed for seed in seeds if seed in TUNING]
     if found:
@@ -149,7 +149,7 @@ class Cell:
 
     request: RunRequest
     columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
-    picture: bool = False  # keep what the camera saw last
+    picture: bool = False  # keep the last picture of the camera
 
 
 Entry_co = TypeVar("Entry_co", covariant=True)
@@ -329,7 +329,7 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
 
 @dataclass
 class Survey:
-    """What runs have in common and in how far they differ; names in the order in which they come first."""
+    """Names and settings of all runs of a batch, found in one pass; names in the order in which they come first."""
 
     count: int = 0
     plants: dict[str, None] = field(default_factory=dict)

@@ -1,1 +1,1 @@
-"""Settings, their defaults, and what is known by name."""
+"""Settings and their defaults; plants, controllers, robots and sensing set-ups by name."""

@@ -26,7 +26,7 @@ from servobench.plant.contract.signals import PlantSpec, Truth
 
 @settings
 class NoSettings:
-    """The settings of what is given as a class without a dataclass of settings: none."""
+    """The settings of a controller or plant that is a class without a dataclass of settings: none."""
 
 
 @settings
@@ -45,7 +45,7 @@ class Guarded:
 
     make: Callable[..., Any]
 
-    def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - whatever the function returns
+    def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - any result
         """Call it.
 
         Raises:
@@ -64,8 +64,8 @@ class Build(Guarded):
     """Builds a controller or a plant by code of a user.
 
     Attributes:
-        make: called with the settings and with what the harness tells: `RobotKnowledge` or `PlantSetup`.
-        kind: of what it has to return.
+        make: called with the settings and a `RobotKnowledge` or `PlantSetup`.
+        kind: class of the result.
         with_config: whether it takes the settings.
     """
 
@@ -93,7 +93,7 @@ class Copy:
     original: Controller
 
     def __call__(self, _knowledge: RobotKnowledge) -> Controller:
-        """Return a copy, so that no run sees what another left behind."""
+        """Return a copy, so that no run sees the state of another."""
         return deepcopy(self.original)
 
 
@@ -215,7 +215,7 @@ class WatchedWorld(World):
 
 
 def missing_spec(made: object) -> str:
-    """Return what to say about a plant or world whose constructor left out its spec."""
+    """Return the message about a plant or world whose constructor left out its spec."""
     spec, name = getattr(made, "spec", None), type(made).__name__
     came = "nothing" if spec is None else type(spec).__name__
     return (

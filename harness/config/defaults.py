@@ -2,7 +2,7 @@
 
 Tuned values are files `controllers/tuned/NAME.toml` that `servobench tune` wrote, with a dot for a colon in the name;
 their table `[settings]` holds nested fields of the configuration. A controller without a file keeps the defaults of its
-class. Values are tuned for arms of which a nominal model is known, where an estimator learns what the model leaves. On
+class. Values are tuned for arms of which a nominal model is known, where an estimator learns the difference from it. On
 an arm without one the estimator has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 

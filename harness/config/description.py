@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
+UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the begin of a string below a field
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
@@ -29,7 +29,7 @@ class Setting:
         key: its dotted name within the section.
         value: as it is.
         unit: of the value, such as `s`; empty where none is told.
-        allowed: which values may be given, in words; empty for what the default shows already.
+        allowed: the values that may be given, in words; empty where the default shows the type already.
         meaning: one line; empty where none is told.
     """
 
@@ -84,7 +84,7 @@ def field_strings(kind: type[Any]) -> dict[str, str]:
 
 
 def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
-    """Return what a type allows, in words; nothing for what the default shows already."""
+    """Return the values that a type allows, in words; empty where the default shows the type already."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         bounds = [
@@ -129,7 +129,7 @@ BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 WIDTH = 100  # characters of a line of comment
 HEAD = """\
 # Settings of servobench, for {use} and other commands.
-# Each line has the value in use; leave out what you do not change. --set SECTION.KEY=VALUE changes one for one call.
+# Each line has the value in use; leave out unchanged ones. --set SECTION.KEY=VALUE changes one for one call.
 """
 
 

@@ -31,14 +31,14 @@ Entry = TypeVar("Entry", ControllerEntry, PlantEntry)
 
 @dataclass(frozen=True)
 class Kind(Generic[Entry]):
-    """What users may give: controllers, or plants.
+    """A kind of object that users may give: controllers, or plants.
 
     Attributes:
         word: for messages.
         entry: its class of entries.
         bases: classes below which it may be given.
-        argument: what a constructor takes beside settings.
-        wanted: what may be given, in words.
+        argument: argument of a constructor beside the settings.
+        wanted: the accepted objects, in words.
         of_class: makes an entry of a class and that of its settings, None if it takes none.
         make: makes an entry of a given object, its place and a name or None; None for `make_entry`.
     """
@@ -89,12 +89,12 @@ def make_entry(kind: Kind[Entry], given: object, place: str, name: str | None = 
 
     Args:
         kind: `CONTROLLER` or `PLANT`.
-        given: what a user gives.
+        given: by the user.
         place: where it stands, for messages.
-        name: what it is to be called; None for the name of the entry or of the class.
+        name: its name; None for the name of the entry or of the class.
 
     Raises:
-        ConfigurationError: it cannot be used; says what to change.
+        ConfigurationError: it cannot be used; says the remedy.
     """
     if isinstance(given, kind.entry):
         if isinstance(given.build, type) and issubclass(given.build, kind.bases):
@@ -158,7 +158,7 @@ def check_settings(config: Callable[[], Any], place: str) -> None:
     """Refuse settings that cannot be made without arguments, or that are no dataclass.
 
     Raises:
-        ConfigurationError: says what to change.
+        ConfigurationError: says the remedy.
     """
     where, name = (_class_place(config), config.__name__) if isinstance(config, type) else (place, "config")
     needed = _without_default(config)
@@ -235,10 +235,10 @@ class Own(Generic[Entry]):
 
     Attributes:
         word: "controller" or "plant".
-        entry: what it is built by.
+        entry: which builds it.
         place: where it stands, for messages.
         source: its file; None where other processes import its module.
-        file: path of the code; empty for what was typed into an interpreter.
+        file: path of the code; empty for code that was typed into an interpreter.
         digest: SHA-256 of the code; empty where it cannot be read.
         given: whether it was given as an object in Python.
     """
@@ -253,11 +253,11 @@ class Own(Generic[Entry]):
 
     @property
     def name(self) -> str:
-        """What it is called in tables."""
+        """Its name in tables."""
         return self.entry.name
 
     def record(self) -> dict[str, str]:
-        """Return what the manifest of a results folder says about it."""
+        """Return its record in the manifest of a results folder."""
         return {"place": self.place, "file": self.file, "sha256": self.digest}
 
 
@@ -265,7 +265,7 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
     """Return the controller or plant at a place, `[NAME=]FILE.py[:NAME]` or `[NAME=]MODULE:NAME`.
 
     Raises:
-        ConfigurationError: whatever is wrong with it, as one line with file and line number.
+        ConfigurationError: it cannot be used; one line with file and line number.
     """
     found = PLACE.fullmatch(text)
     if found is None:
@@ -304,7 +304,7 @@ def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
 
 
 def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> object:
-    """Return what a module calls `name`, or without a name its only controller or plant."""
+    """Return the object called `name` in a module, or without a name its only controller or plant."""
     found = _members(kind, module)
     if name is not None:
         if not hasattr(module, name):
@@ -326,7 +326,7 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
 
 
 def _members(kind: Kind[Any], module: ModuleType) -> dict[str, object]:
-    """Return what a module defines of a kind itself; classes that lack methods only if there are no others."""
+    """Return the objects of a kind that a module defines; classes that lack methods only if there are no others."""
     found: dict[str, object] = {
         name: value
         for name, value in vars(module).items()

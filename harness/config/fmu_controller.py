@@ -55,7 +55,7 @@ class ControllerMapping:
     outputs: Annotated[Names, MinLen(1)]
     """Joint velocity commands, rad/s."""
     features: Annotated[Names, MinLen(1)]
-    """Inputs for what is measured, in the unit of the plant."""
+    """Inputs for the measured features, in the unit of the plant."""
     reference: Annotated[Names, MinLen(1)]
     """Inputs for the desired feature: now, and if there are more at the next instants, row by row."""
     joints: Names = ()
@@ -80,7 +80,7 @@ class FmuControllerState(NamedTuple):
 
 @final
 class FmuController(Controller):
-    """u ← fmi…GetReal after fmi…DoStep with what is seen as inputs."""
+    """u ← fmi…GetReal after fmi…DoStep with the measured features as inputs."""
 
     def __init__(self, mapping: ControllerMapping, knowledge: RobotKnowledge) -> None:
         """Extract and load the FMU and look all names up.
@@ -148,7 +148,7 @@ class FmuController(Controller):
         self._fresh = False
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
-        """Return what the FMU answers to this instant.
+        """Return the output of the FMU for this instant.
 
         Raises:
             FmuError: the FMU failed, or its answer is not finite.

@@ -30,34 +30,34 @@ def has_no_wheel() -> bool:
     return sys.version_info >= NO_WHEELS
 
 
-def missing_extra(error: ImportError, what: str) -> str | None:
+def missing_extra(error: ImportError, user: str) -> str | None:
     """Return the line for the user about an import that failed; None where no extra brings the module.
 
     Args:
         error: of the import.
-        what: what needs the module, such as "a film".
+        user: the feature that needs the module, such as "a film".
     """
     module = (error.name or "").partition(".")[0]
-    return _line(module, what) if module in EXTRAS else None
+    return _line(module, user) if module in EXTRAS else None
 
 
-def check_installed(modules: tuple[str, ...], what: str) -> None:
+def check_installed(modules: tuple[str, ...], user: str) -> None:
     """Check that the modules of extras are there, without importing them.
 
     Args:
         modules: top-level names.
-        what: what needs them, such as "plant 'bullet'".
+        user: the feature that needs them, such as "plant 'bullet'".
 
     Raises:
-        ConfigurationError: one is missing; the message says what to install.
+        ConfigurationError: one is missing; the message says the remedy.
     """
     for module in modules:
         if find_spec(module) is None:
-            raise ConfigurationError(_line(module, what))
+            raise ConfigurationError(_line(module, user))
 
 
-def _line(module: str, what: str) -> str:
-    line = f"{what} needs {module}: pip install " + (f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module)
+def _line(module: str, user: str) -> str:
+    line = f"{user} needs {module}: pip install " + (f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module)
     if module == "pybullet" and has_no_wheel():
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"
@@ -86,7 +86,7 @@ def git_commit() -> str | None:
 
 
 def version_line() -> str:
-    """Return what `servobench --version` prints."""
+    """Return the line that `servobench --version` prints."""
     commit = git_commit()
     hash_, dirty, _ = (commit or "").partition("-dirty")
     where = f" (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})" if commit else ""

@@ -179,7 +179,7 @@ def installed_plant(name: str) -> PlantEntry:
     """Return the plant called `name` if all that it needs is installed.
 
     Raises:
-        ConfigurationError: as `find_plant`, or an extra or a renderer is missing; the message says what to install.
+        ConfigurationError: as `find_plant`, or an extra or a renderer is missing; the message says the remedy.
     """
     entry = find_plant(name)
     check_installed(entry.needs, f"plant {name!r}")
@@ -257,7 +257,7 @@ def _load_controller(name: str) -> ControllerEntry:
 
 
 def _published(group: str, kind: Kind[Entry], name: str, given: object) -> Entry:
-    """Return the entry of what a third party publishes."""
+    """Return the entry of a published controller or plant."""
     value = _points(group)[name].value
     try:
         return make_entry(kind, given, value, name)
@@ -321,7 +321,7 @@ def default_plant() -> tuple[str, str]:
 
 
 def scene_of(plant: str) -> OpenScene:
-    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
+    """Return the constructor of scenes of a rendered plant's engine; engines load slowly, so only here."""
     if plant == "mujoco":
         from servobench.plant.rendered.mujoco import MujocoScene  # noqa: PLC0415
 
@@ -335,7 +335,7 @@ def rendered_plant(named: str | None = None) -> str:
     """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
 
     Raises:
-        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
+        ConfigurationError: the engine is missing, or all of them are; the message says the remedy.
     """
     name, why = (named, "") if named is not None and named in RENDERED else default_plant()
     if name == UNRENDERED:

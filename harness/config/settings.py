@@ -2,7 +2,7 @@
 
 A section is the name of a plant, a controller or a task, or `run`; keys below it are the fields of its dataclass,
 nested with dots. Nothing else is read from the files, and an unknown section or key is refused. A file may serve many
-commands, so it may have sections of what does not run; an assignment is meant for one, and must have an effect there.
+commands, so it may have sections that do not run; an assignment is meant for one, and must have an effect there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Config = TypeVar("Config")
 
 
 class Assignment(NamedTuple):
-    """What a user wrote after --set."""
+    """The argument of an option --set."""
 
     section: str
     key: str  # with dots
@@ -29,7 +29,7 @@ class Assignment(NamedTuple):
 
 
 class ConfigurationError(ValueError):
-    """A setting or name that cannot be used; the message is one line for the user, whatever was given."""
+    """A setting or name that cannot be used; the message is one line for the user, also for a text of several."""
 
     def __init__(self, message: str) -> None:
         """Keep the message without line ends and without characters that would control a terminal."""
@@ -81,7 +81,7 @@ class Settings:
         for section, _, text in self.assigned:
             if section not in names:
                 raise ConfigurationError(
-                    f"--set {text}: {section!r} does not run here, so this has no effect; what runs: "
+                    f"--set {text}: {section!r} does not run here, so this has no effect; sections that run: "
                     f"{listed(names)}; settings of other runs may stand in a file (--config)"
                 )
 

@@ -36,7 +36,7 @@ class SourceFile:
 
     Attributes:
         path: of the file, absolute.
-        text: what it holds.
+        text: its content.
     """
 
     path: Path
@@ -74,7 +74,7 @@ class SourceFile:
         """Carry out the file, once in a process, and return its module; files beside it can be imported.
 
         Raises:
-            ConfigurationError: whatever goes wrong, as one line with file and line number.
+            ConfigurationError: it cannot be executed; one line with file and line number.
         """
         name = self.module_name
         if name in sys.modules:
@@ -161,7 +161,7 @@ def describe_at(error: BaseException, folder: Path) -> str:
     """Return an error as one line, `FILE:LINE: KIND: MESSAGE`, with the last place in code of the user.
 
     Args:
-        error: what was raised.
+        error: as it was raised.
         folder: that of the user's code.
     """
     if isinstance(error, SyntaxError) and error.filename:
@@ -275,7 +275,7 @@ def _imported(file: Path, root: Path) -> Iterator[Path]:
 
 
 def _names(node: ast.AST, package: Name) -> Iterator[Name]:
-    """Yield the names that a statement imports, those of modules and of what may be one."""
+    """Yield the names that a statement imports, those of modules and of objects that may be modules."""
     match node:
         case ast.Import(names=names):
             yield from (tuple(each.name.split(".")) for each in names)

@@ -56,7 +56,7 @@ Varied: TypeAlias = tuple[tuple[str, Value], ...]
 
 @settings
 class RunSettings:
-    """The section `run`: what is common to all plants, controllers and tasks."""
+    """The section `run`: settings that all plants, controllers and tasks share."""
 
     period: Positive = 0.05
     """[s] control period"""

@@ -74,8 +74,8 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
 
     Args:
         requests: the runs.
-        settings: what is set.
-        to_run: whether what the plants need has to be installed; their settings are known without it.
+        settings: overrides of the defaults.
+        to_run: whether the libraries of the plants have to be installed; their settings are known without it.
 
     Raises:
         ConfigurationError: an unknown name, or a setting that cannot be used.
@@ -137,7 +137,7 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
 
 
 def check_settings(settings: Settings, running: Iterable[str]) -> None:
-    """Refuse settings that nothing would read, here or elsewhere, and assignments to what does not run.
+    """Refuse settings that nothing would read, here or elsewhere, and assignments to sections that do not run.
 
     Args:
         settings: overrides of the defaults.

@@ -22,7 +22,7 @@ class SensingConfig:
     """Settings of the path from the true feature to the observation."""
 
     feature_noise: NonNegative = 0.001
-    """[m] standard deviation σ of the noise of each component; of pixels, what it is in the planned image."""
+    """[m] standard deviation σ of the noise of each component; of pixels, its size in the planned image."""
     latency: NonNegative = 0.0
     """[s] between exposure and delivery of a frame; a multiple of the control period, or whole milliseconds."""
     drop_probability: ShareBelowOne = 0.0
@@ -87,7 +87,7 @@ class SensorAxis(NamedTuple):
     Attributes:
         units: its units with their sizes in SI units; the empty one for a plain number.
         example: of a magnitude.
-        setting: what it sets.
+        setting: its key in `SensingConfig`.
         family: the family of noise that it chooses; None for none.
     """
 

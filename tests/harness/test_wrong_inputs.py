@@ -87,7 +87,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--set", "constant.initial.source=prob"), "did you mean 'probe'?"),
     ((*RUN, "--set", "bullet.lag=0.1"), "--set bullet.lag=0.1: 'bullet' does not run here, so this has no effect"),
     ((*RUN, "--set", "bullet.latency_periods=2"), "'bullet' does not run here"),
-    ((*RUN, "--set", "ukf_mfac.law.gain=3"), "what runs: run, kinematic, constant, exp2; settings of other runs"),
+    ((*RUN, "--set", "ukf_mfac.law.gain=3"), "sections that run: run, kinematic, constant, exp2; settings"),
     ((*RUN, "--set", "circle.laps=3"), "'circle' does not run here"),
     ((*RUN, "--set", "run.period=0"), "run.period must be above 0, got 0"),
     ((*RUN, "--set", "run.preview_time=60"), "run.preview_time must be no longer than the run of 10 s, got 60 s"),
