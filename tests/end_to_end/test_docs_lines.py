@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from contextlib import nullcontext, suppress
 
 import pytest
 import typer
@@ -17,6 +18,7 @@ from kit.own import CONFIGURED, write
 from servobench.harness.batch import campaign
 from servobench.harness.cli.main import app
 from servobench.harness.config.registry import default_plant
+from servobench.harness.config.settings import ConfigurationError
 
 SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")
@@ -63,12 +65,14 @@ def test_the_pages_show_every_command():
 
 @pytest.mark.parametrize("words", LINES)
 def test_every_line_is_one_that_the_command_line_reads(words):
+    own = any(name in word for word in words for name in OWN)
     command = typer.main.get_command(app)
     context = command.make_context("servobench", list(words))
     while hasattr(command, "resolve_command"):
         name, command, rest = command.resolve_command(context, context._protected_args + context.args)
         if "--help" not in rest:
-            context = command.make_context(name, rest, parent=context)
+            with suppress(ConfigurationError) if own else nullcontext():  # of a file that is the reader's
+                context = command.make_context(name, rest, parent=context)
     options = {option for each in command.params for option in each.opts} | {"--help"}
     assert {word for word in words if word.startswith("--")} <= options
 

@@ -22,7 +22,7 @@ from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.outcome import pose_error
-from servobench.harness.run.references import ImageReference
+from servobench.harness.run.references import FollowedCurve
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
@@ -130,7 +130,7 @@ def test_curves_are_the_image_of_the_ball_on_the_curve_of_position(word, task):
 def test_a_circle_of_a_plate_keeps_its_orientation_and_is_in_reach_of_the_arm():
     run, robot = drawn("plate", "circle"), find_robot("ur5")
     reference, model = run.scenario.reference, run.true
-    assert isinstance(reference, ImageReference)
+    assert isinstance(reference, FollowedCurve)
     home, limit = model.points(robot.workspace.home), np.full(6, 2 * np.pi)
     q = robot.workspace.home
     for time in np.linspace(0.0, 10.0, 21):
