@@ -39,7 +39,6 @@ from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
 from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
-from servobench.harness.cli.studies import _numbers, _times
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, read_settings
 from servobench.harness.run.references import read_waypoints
@@ -228,7 +227,7 @@ WORDS: dict[str, Parser] = {
     "--seeds": Parser(_seeds, ("5", "3,1,4", "100:120", "7,"), (",", ":", *NUMBERS), 4),
     "--vary": Parser(
         lambda text, _: SweepPlan.parse(Batch((), (), (), (), ()), [text]),
-        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1"),
+        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1", "noise=0,1,2.5", "latency=0,0.1"),
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
@@ -239,8 +238,6 @@ WORDS: dict[str, Parser] = {
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
-    "--noise": Parser(lambda text, _: _numbers("noise", text), ("1", "0,1,2.5"), (",", *NUMBERS), 2),
-    "--latency": Parser(lambda text, _: _times("latency", text), ("0.05", "0,0.1"), (",", *NUMBERS), 2),
     "--robot": Parser(lambda text, _: find_robot(text), ("ur5", "panda"), ("~", "#", "/", "\0", "a.yaml", ".urdf"), 2),
     "--plants": Parser(lambda text, _: split_plants(text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
     "--controllers": Parser(
