@@ -223,18 +223,11 @@ XML_WORDS = (
 )  # fmt: skip
 ZIP_WORDS = ("PK\x01\x02", "PK\x03\x04", "PK\x05\x06", "PK\x06\x06", "\xff\xff\xff\xff", "../", "\x00")
 
-NO_BATCH = Batch((), (), (), (), ())
-
-
-def _variation(name: str, values: str) -> SweepPlan:
-    return SweepPlan.parse(NO_BATCH, [f"{name}={values}"])
-
-
 WORDS: dict[str, Parser] = {
     "--seeds": Parser(_seeds, ("5", "3,1,4", "100:120", "7,"), (",", ":", *NUMBERS), 4),
     "--vary": Parser(
-        lambda text, _: SweepPlan.parse(NO_BATCH, [text]),
-        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1"),
+        lambda text, _: SweepPlan.parse(Batch((), (), (), (), ()), [text]),
+        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1", "noise=0,1,2.5", "latency=0,0.1"),
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
@@ -245,8 +238,6 @@ WORDS: dict[str, Parser] = {
         (*AXIS_WORDS, *NUMBERS),
         4,
     ),
-    "--noise": Parser(lambda text, _: _variation("noise", text), ("1", "0,1,2.5"), (",", *NUMBERS), 2),
-    "--latency": Parser(lambda text, _: _variation("latency", text), ("0.05", "0,0.1"), (",", *NUMBERS), 2),
     "--robot": Parser(lambda text, _: find_robot(text), ("ur5", "panda"), ("~", "#", "/", "\0", "a.yaml", ".urdf"), 2),
     "--plants": Parser(lambda text, _: split_plants(text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
     "--controllers": Parser(
