@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import tempfile
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,6 +24,23 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Hand a file with a mark `xdist_group` to one process: pytest 9.2 drops what pytest-xdist 3.8 adds to names."""
+    from xdist.scheduler import LoadGroupScheduling
+
+    @cache
+    def is_group(path: str) -> bool:
+        return "mark.xdist_group(" in (config.rootpath / path).read_text(encoding="utf-8")
+
+    class ByGroup(LoadGroupScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            path = nodeid.split("::", maxsplit=1)[0]
+            return path if is_group(path) else nodeid
+
+    return ByGroup(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
 @pytest.fixture(scope="session", autouse=True)
