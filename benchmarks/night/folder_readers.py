@@ -20,11 +20,11 @@ from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch import results
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 from servobench.harness.studies.tuning.scoring import Ledger
 from servobench.plant.contract import cache as entries
 from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.faults import ConfigurationError
 
 SCORES = {"objective": 3, "robots": 2}
 LEDGER = json.dumps(SCORES) + '\n{"settings": {"law": {"gain": 1.5}}, "costs": [0.5, 2]}\n'

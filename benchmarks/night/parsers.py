@@ -40,10 +40,11 @@ from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
 from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
 from servobench.harness.config.robots import find_robot
-from servobench.harness.config.settings import ConfigurationError, read_settings
+from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolution import check_settings, resolve
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description, read_exchange

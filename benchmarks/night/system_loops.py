@@ -16,9 +16,10 @@ from fmpy.ssp.simulation import simulate_ssp
 from servobench.fmus.compiler import this_platform
 from servobench.fmus.ssp import write_loop
 from servobench.harness.batch.api import run
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.export import loop_products
 from servobench.harness.run.request import RunRequest
+from servobench.plant.contract.faults import ConfigurationError
 
 PERIOD, ROWS = 0.05, 100
 EXACT = {"command_delay": PERIOD, "sensing": {"feature_noise": 0.0, "latency": 0.0}}

@@ -26,8 +26,9 @@ from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.faults import ConfigurationError
 
 RUNS = 4
 BATCH = Batch(("kinematic",), ("constant",), ("random",), ("moderate",), range(RUNS))

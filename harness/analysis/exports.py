@@ -15,7 +15,7 @@ import pandas as pd
 
 from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import reason
 
 CSV, MCAP = "csv", "mcap"

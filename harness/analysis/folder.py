@@ -10,9 +10,9 @@ import pandas as pd
 from pyarrow import ArrowException
 
 from servobench.harness.batch import results
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.faults import ConfigurationError
 
 DESCRIBED: Final = {
     "plant": "plant",

@@ -35,11 +35,11 @@ from servobench.harness.analysis.statistics import (
     median_with_interval,
     tail_mean,
 )
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.metrics import METRICS, Summary
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
 from servobench.harness.run.request import SECTIONS, SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text

@@ -26,10 +26,10 @@ from servobench.harness.analysis.comparison import (
 )
 from servobench.harness.analysis.statistics import Estimate, holm, median_with_interval, signed_rank_p_value
 from servobench.harness.config.registry import CONTROLLERS, find_controller
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.faults import ConfigurationError
 
 LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"

@@ -21,7 +21,7 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolution import check_settings
@@ -29,6 +29,7 @@ from servobench.harness.run.result import RunResult
 from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.faults import ConfigurationError
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry

@@ -43,12 +43,12 @@ from servobench.harness.config.registry import (
     offering,
     own_modules,
 )
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import SourceFile
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
+from servobench.plant.contract.faults import ConfigurationError
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
 RUN_ID: Final = "run_id"

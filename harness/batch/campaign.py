@@ -35,12 +35,13 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
-from servobench.harness.config.settings import Assignment, ConfigurationError, Settings
+from servobench.harness.config.settings import Assignment, Settings
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
+from servobench.plant.contract.faults import ConfigurationError
 
 Row = dict[str, Any]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs

@@ -11,9 +11,9 @@ from servobench.harness.batch import results, tables
 from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.batch.tables import DamagedFile, lacking, sums_of, writing
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import log_entry
 from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"

@@ -20,8 +20,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
 LOCK = ".lock"

@@ -10,9 +10,10 @@ import pandas as pd
 
 from servobench.harness.batch import results
 from servobench.harness.config.robots import OWN_ROBOT
-from servobench.harness.config.settings import ConfigurationError, Settings, nest
+from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
 

@@ -22,9 +22,9 @@ import numpy as np
 
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 MAX_SEEDS: Final = 1_000_000  # of a batch

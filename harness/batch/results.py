@@ -25,9 +25,9 @@ import pyarrow.dataset as ds
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, write_atomically
 
 if TYPE_CHECKING:

@@ -37,8 +37,8 @@ from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits, show_size
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
+from servobench.plant.contract.faults import ConfigurationError
 
 POSSIBLE: Final = hasattr(os, "fork")  # whether this system has sandboxes
 LOST: Final = "the run killed the process that carried it out"

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
+from servobench.plant.contract.faults import ConfigurationError
 
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds

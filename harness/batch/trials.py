@@ -29,7 +29,7 @@ from servobench.harness.config.registry import (
     published,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import PACKAGES, PLACE, folder_of_module, is_below, place_in_trace
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
@@ -37,7 +37,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.contract.faults import FmuError, RunFault
+from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault
 from servobench.plant.contract.files import user_path
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from servobench.harness.config.adapters import Build, folder_of
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import choose_controller, find_controller, offer, offering
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 JOINTS, FEATURES = 6, 3
 OTHER_SIZES: Final = (7, 2)

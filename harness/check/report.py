@@ -9,8 +9,8 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at
+from servobench.plant.contract.faults import ConfigurationError
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
 WIDTH: Final = 14  # of the names of checks, in print

@@ -155,7 +155,7 @@ def _line_of_system(error: OSError) -> str | None:
 def _line_for_user(error: ValueError | ImportError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
-    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.contract.faults import ConfigurationError
 
     if isinstance(error, ImportError):
         return missing_extra(error, "this command")

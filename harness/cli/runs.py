@@ -184,8 +184,8 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.figures import draw_figures
+    from servobench.plant.contract.faults import ConfigurationError
     from servobench.plant.contract.files import point_latest
 
     runs = results.load_runs(folder)

@@ -36,7 +36,7 @@ def refuse(line: str) -> NoReturn:
     Raises:
         ConfigurationError: always; `main` prints its line.
     """
-    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.contract.faults import ConfigurationError
 
     raise ConfigurationError(line)
 

@@ -13,12 +13,11 @@ from typing import Any, final
 import numpy as np
 
 from servobench.controllers.controller import Controller, RobotKnowledge
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import PlantDiverged, RunFault
+from servobench.plant.contract.faults import ConfigurationError, PlantDiverged, RunFault
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings
 from servobench.plant.contract.signals import PlantSpec, Truth

@@ -16,7 +16,8 @@ from importlib.resources.abc import Traversable
 from typing import Any
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
+from servobench.plant.contract.faults import ConfigurationError
 
 
 def file_stem(name: str) -> str:

@@ -19,9 +19,9 @@ from typing import Any, Final, Generic, TypeVar, get_type_hints
 
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.config.adapters import BenchSettings, Build, Copy, Guarded, NoSettings, OnBench, folder_of
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PLACE, SourceFile, describe_at, digest_of_module, import_user_module, show
 from servobench.plant.bench.plant import Plant, PlantEntry, World
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
 NAME: Final = re.compile(r"\w+(?:[:-]\w+)*")

@@ -27,9 +27,9 @@ from servobench.harness.config.entries import (
     read_own,
 )
 from servobench.harness.config.installation import check_installed, has_no_wheel
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_import, is_place
 from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
 

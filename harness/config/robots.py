@@ -6,10 +6,10 @@ import re
 from functools import lru_cache
 from typing import Final
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PLACE, SourceFile
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.robot import Robot
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import listed, override, suggest
 
@@ -26,15 +27,6 @@ class Assignment(NamedTuple):
     section: str
     key: str  # with dots
     text: str  # as it was written
-
-
-class ConfigurationError(ValueError):
-    """A setting or name that cannot be used; the message is one line for the user, also for a text of several."""
-
-    def __init__(self, message: str) -> None:
-        """Keep the message without line ends and without characters that would control a terminal."""
-        words = " ".join(message.split())
-        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))
 
 
 @dataclass(frozen=True)

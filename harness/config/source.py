@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, TypeAlias
 
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import reason, user_path
 from servobench.plant.contract.settings import suggest
 

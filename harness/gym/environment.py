@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.gym.spaces import Floats32, Spaces
 from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
 from servobench.harness.run.loop import Rollout
@@ -21,7 +21,7 @@ from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
 from servobench.harness.gym.spaces import Floats32, Spaces
 from servobench.harness.run.lanes import Together, build_together, side_by_side_key
 from servobench.harness.run.loop import Rollout
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import BoolArray, Command, Observation
 

@@ -25,11 +25,11 @@ from matplotlib.figure import Figure
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.installation import missing_extra
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.workspace import BALL_RADIUS

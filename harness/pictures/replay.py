@@ -19,10 +19,10 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.room import Overview, Room

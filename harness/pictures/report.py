@@ -38,7 +38,6 @@ from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.figures import page_figures
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.style import (
@@ -57,6 +56,7 @@ from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.request import varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 
 NAME: Final = "report.html"

@@ -18,9 +18,9 @@ import pandas as pd
 
 from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, with_places
 from servobench.harness.batch import results
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 
 FEATURE = "feature_"
 LONG = 6000  # [rows] of a run that is not drawn row by row

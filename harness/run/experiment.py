@@ -23,7 +23,7 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -35,7 +35,7 @@ from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueMode
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import PlantSpec

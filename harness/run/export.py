@@ -31,13 +31,13 @@ from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.robots import find_robot
-from servobench.harness.config.settings import ConfigurationError, Settings, flatten
+from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
 
 REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, SupportsIndex, TypeAlias
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, settings
 from servobench.plant.robot.mismatch import Mismatch
 

@@ -16,11 +16,12 @@ from servobench.harness.config.registry import (
     plant_names,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import ConfigurationError, Settings, nest
+from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, RunSettings, Varied
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
 

@@ -11,7 +11,6 @@ from typing import Final, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import JOINT_UNIT, StepLog, column_name
@@ -19,7 +18,7 @@ from servobench.harness.run.loop import LoopSettings, careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 COMMAND: Final = "joint_velocity_command"

@@ -22,13 +22,13 @@ import numpy as np
 from servobench.harness.config.entries import Kind, check_class, check_settings, read_own
 from servobench.harness.config.registry import ALL, RUN, offer, offered
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_import, is_place
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator

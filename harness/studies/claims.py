@@ -39,8 +39,9 @@ from servobench.harness.analysis.statistics import (
 )
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import did_you_mean
 
 ALIKE_SHARE: Final = 0.10  # of the median settling time

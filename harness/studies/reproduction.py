@@ -17,10 +17,10 @@ from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
 from servobench.harness.studies.claims import DIVISIONS, MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
+from servobench.plant.contract.faults import ConfigurationError
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
 FIGURES: Final = "figures"

@@ -26,7 +26,7 @@ from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import (
     TEXT,
@@ -41,6 +41,7 @@ from servobench.harness.pictures.style import (
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes

@@ -1,4 +1,4 @@
-"""Every named reason why a run ends before its last period; `status` is its word in the table of runs.
+"""The named errors: why a run ends before its last period (`status` is its word in the table of runs), or never begins.
 
     RunFault                    fault
     ├── PlantDiverged           plant_diverged
@@ -9,7 +9,10 @@
     ├── FilterDiverged          filter_diverged
     └── SolverFailed            solver_failed
 
-A plant or controller of a third party derives its own from `RunFault`. Bad settings are a `ValueError`, not a fault.
+    ValueError
+    └── ConfigurationError      no run: a setting or name that cannot be used
+
+A plant or controller of a third party derives its own from `RunFault`.
 """
 
 from __future__ import annotations
@@ -63,3 +66,12 @@ class SolverFailed(RunFault):
     """An optimiser returned no usable answer and no fallback was configured."""
 
     status: ClassVar[str] = "solver_failed"
+
+
+class ConfigurationError(ValueError):
+    """A setting or name that cannot be used; the message is one line for the user, also for a text of several."""
+
+    def __init__(self, message: str) -> None:
+        """Keep the message without line ends and without characters that would control a terminal."""
+        words = " ".join(message.split())
+        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))

@@ -12,7 +12,6 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.campaign import (
     StudyRecord,
     TuningPlan,
@@ -33,6 +32,7 @@ from servobench.harness.studies.tuning.spaces import (
     find_tunable,
     nested_settings,
 )
+from servobench.plant.contract.faults import ConfigurationError
 
 TUNED = Path(controllers.__file__).parent / "tuned" / "constant.toml"
 

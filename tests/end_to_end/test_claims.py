@@ -10,7 +10,6 @@ import pytest
 
 from kit.command import servobench
 from servobench.harness.batch.plan import TUNING
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.claims import (
     CIRCLE,
     DEPENDS,
@@ -36,6 +35,7 @@ from servobench.harness.studies.reproduction import (
     read_answers,
     write_tables,
 )
+from servobench.plant.contract.faults import ConfigurationError
 
 METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
 SEEDS = range(20)

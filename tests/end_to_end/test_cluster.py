@@ -16,7 +16,7 @@ from kit.own import CONFIGURED, CONFIGURED_CELL, write
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 

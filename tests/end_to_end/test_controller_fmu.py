@@ -13,9 +13,10 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
 from kit.fmpy_instance import Driven
 from servobench.fmus.inspection import validate_fmu
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run import export as controller_fmu
 from servobench.harness.run.request import RunRequest
+from servobench.plant.contract.faults import ConfigurationError
 
 pytestmark = pytest.mark.xdist_group("controller_fmu")  # one process makes what these tests share
 

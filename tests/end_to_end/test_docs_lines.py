@@ -18,7 +18,7 @@ from kit.own import CONFIGURED, write
 from servobench.harness.batch import campaign
 from servobench.harness.cli.main import app
 from servobench.harness.config.registry import default_plant
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")

@@ -15,7 +15,7 @@ from servobench.harness.config import installation as extras
 from servobench.harness.config import registry
 from servobench.harness.config import registry as engines
 from servobench.harness.config.installation import EXTRAS
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)
 QUICK = ("run", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", "out")

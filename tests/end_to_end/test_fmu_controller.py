@@ -9,10 +9,11 @@ from kit.controller_fmus import exported
 from kit.foreign_fmu import build_crane, build_pilot
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import choose_controller, find_controller
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.plant.contract.faults import ConfigurationError
 
 SETTINGS = {"kinematic": {"sensing": {"drop_probability": 0.05}}}
 MAPPING = """

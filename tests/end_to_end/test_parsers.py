@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from night.folder_readers import HOLDER, LEDGER
 from night.fuzzing import Broken, check, inputs
 from night.parsers import PARSERS, Parser
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 LONG = "9" * 400
 FOUND: tuple[tuple[str, str | bytes], ...] = (  # what once was a traceback, a hang or gigabytes

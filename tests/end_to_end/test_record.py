@@ -20,13 +20,14 @@ from kit.command import finish, servobench, start, wait_for
 from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.pictures import film
 from servobench.harness.pictures import film as encoder
 from servobench.harness.pictures.replay import Replay, Trail, logged_run, stretch
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
+from servobench.plant.contract.faults import ConfigurationError
 
 pytestmark = [NEEDS_BULLET, pytest.mark.xdist_group("record")]  # it renders what is shown
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)

@@ -13,9 +13,9 @@ from kit.browser import browser_page, find_browser
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.batch import results
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures import report
 from servobench.plant.contract.checksums import SUMS, write_vouched
+from servobench.plant.contract.faults import ConfigurationError
 
 pytestmark = pytest.mark.xdist_group("report")  # one process makes what these tests share
 

@@ -19,8 +19,8 @@ from servobench.harness.batch import campaign, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.scoring import Ledger
+from servobench.plant.contract.faults import ConfigurationError
 
 SWEEP = (
     "sweep", "--controllers", "constant,rls", "--seeds", "200", "--workers", "1", "--set", "random.duration=6",

@@ -13,8 +13,8 @@ from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import CHUNK
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
+from servobench.plant.contract.faults import ConfigurationError
 
 pytestmark = pytest.mark.xdist_group("sweep")  # one process makes what these tests share
 

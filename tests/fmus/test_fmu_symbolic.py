@@ -14,12 +14,13 @@ from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibrate
 from servobench.fmus.export import default_actuation
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.model_exchange import FmuModel
 from servobench.plant.fmu.world import fmu_entry

@@ -15,7 +15,7 @@ from kit.command import servobench as command
 from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
 from servobench.harness.batch.campaign import changed_source
 from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered, offering
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 ENTRY = '\n\nENTRY = servobench.PlantEntry("cell", "one line", CellConfig, Cell)\n'

@@ -15,7 +15,7 @@ import servobench
 from kit.command import PACKAGE, judged
 from kit.resting import Resting
 from servobench.harness.config.adapters import NoSettings
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 

@@ -18,11 +18,12 @@ from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_siz
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.sandbox import Answer, End, Workers
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
+from servobench.plant.contract.faults import ConfigurationError
 
 PLAN = SweepPlan.parse(
     Batch(("kinematic",), ("constant", "broyden"), ("random",), ("moderate",), range(6)),

@@ -17,11 +17,12 @@ from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.description import configuration_file, describe_settings
 from servobench.harness.config.registry import controller_names
-from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
+from servobench.harness.config.settings import Settings, flatten, read_settings
 from servobench.harness.run import resolution as resolved
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.run.tasks import TASKS
+from servobench.plant.contract.faults import ConfigurationError
 
 PLANTS = ("kinematic", "bullet", "mujoco", "fmu")
 

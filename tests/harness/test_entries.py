@@ -13,7 +13,7 @@ from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.batch import trials
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered, offering
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 TWO = WHOLE + "\n\nclass Other(Mine):\n    pass\n"

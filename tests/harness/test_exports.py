@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from servobench.harness.analysis.exports import export_folder
 from servobench.harness.batch.api import compare, load
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from kit.documents import blocks
 from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import RENDERED, default_plant
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
 from servobench.harness.gym.environment import MARK, ServoEnv
 from servobench.harness.gym.vector import ServoVectorEnv
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.rendered.room import Overview
 
 RENDERS = default_plant()[0] in RENDERED

@@ -20,8 +20,9 @@ from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.tables import DamagedFile
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import SUMS, fault, read_sums
+from servobench.plant.contract.faults import ConfigurationError
 
 pytestmark = pytest.mark.xdist_group("integrity")  # one process makes what these tests share
 

@@ -17,7 +17,7 @@ import pytest
 
 from kit.command import PACKAGE
 from servobench.harness.batch.lock import LOCK, Holder, locked
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 HOLD = """
 import sys

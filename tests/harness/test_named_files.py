@@ -11,8 +11,8 @@ import servobench
 from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import offering
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import neighbours
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
 
 MINE = """

@@ -6,9 +6,10 @@ import pytest
 
 from kit.plants import NEEDS_BULLET
 from servobench.harness.config.registry import controller_names, engine_of
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.mismatch import Mismatch
 
 

@@ -16,13 +16,13 @@ from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results, tables
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.tables import NEEDED
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest, write_atomically
 
 STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}

@@ -13,12 +13,13 @@ from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.catalogue import find_robot
 
 PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")

@@ -11,7 +11,7 @@ import pytest
 from kit.command import servobench
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.studies import robustness
 from servobench.harness.studies.robustness import (
     KNOWN_LINES,
@@ -26,6 +26,7 @@ from servobench.harness.studies.robustness import (
     predicted_limits,
     settling_median,
 )
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.mismatch import Magnitude
 

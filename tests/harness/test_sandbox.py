@@ -16,7 +16,7 @@ from kit.command import PACKAGE
 from servobench.harness.batch import processes, sandbox
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 
 def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servobench.harness.batch.plan import TUNING, refuse_tuning_seeds, tuning_seeds
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 
 @given(count=st.integers(1, 500), offset=st.integers(0, 9500))

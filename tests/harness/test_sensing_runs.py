@@ -17,7 +17,7 @@ from servobench.harness.batch.manifest import describe_sensing, named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import find_sensing, sensing_names
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
@@ -29,6 +29,7 @@ from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.model import SetupModel
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.inverse import closest_distance, reach_pose

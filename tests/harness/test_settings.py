@@ -5,8 +5,9 @@ from typing import Literal
 
 import pytest
 
-from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
+from servobench.harness.config.settings import Settings, flatten, read_settings
 from servobench.plant.contract.checks import check_number
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import Positive, nested, settings
 
 

@@ -9,8 +9,8 @@ import pytest
 from kit.command import servobench
 from servobench import compare
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.shadow import COMMAND, LOGGED, differences, shadow
+from servobench.plant.contract.faults import ConfigurationError
 
 MOVED = "moderate+camera_move=5deg"
 SECTIONS = {

@@ -23,7 +23,7 @@ from servobench.harness.analysis.tables import (
 )
 from servobench.harness.batch import results
 from servobench.harness.cli import terminal
-from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError
 
 
 @pytest.fixture

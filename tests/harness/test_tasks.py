@@ -16,9 +16,9 @@ from kit.command import servobench as command
 from kit.documents import blocks
 from kit.own import write
 from servobench.harness.config.registry import offering
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import tasks
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
+from servobench.plant.contract.faults import ConfigurationError
 
 PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
 (SPIRAL,) = (block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block)

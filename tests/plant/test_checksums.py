@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from servobench.harness.batch.tables import UnwritableFolder, sums_of, writing
-from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.checksums import SUMS, append_sums, fault, keep_sums, read_sums, write_vouched
+from servobench.plant.contract.faults import ConfigurationError
 
 DIGESTS = "a" * 64, "b" * 64, "c" * 64
 

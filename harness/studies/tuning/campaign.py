@@ -22,7 +22,6 @@ from typing import Any, Final, final
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import default_config, file_stem
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.objective import TuningSet, score
 from servobench.harness.studies.tuning.scoring import (
     LEDGER,
@@ -42,6 +41,7 @@ from servobench.harness.studies.tuning.spaces import (
     nested_settings,
     values_of,
 )
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.settings import Count, Periods, settings
 

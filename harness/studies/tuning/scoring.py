@@ -22,13 +22,13 @@ import numpy as np
 from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import apply_settings, default_config, file_stem
-from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.config.settings import flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
 from servobench.harness.studies.tuning.spaces import Point, find_tunable, nested_settings
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 SECOND: Final = ".second"  # of the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Point]

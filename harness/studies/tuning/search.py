@@ -20,7 +20,6 @@ from optuna.samplers import TPESampler
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.defaults import apply_settings, tuned_settings
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     Distribution,
@@ -33,6 +32,7 @@ from servobench.harness.studies.tuning.spaces import (
     nested_settings,
     values_of,
 )
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.seeds import named_seed
 
 STEP: Final = 0.2  # [1] share of a number by which it is changed

@@ -24,7 +24,8 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from servobench.controllers.aids import RANGES, SWITCHES
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.config.settings import flatten
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
 Distribution: TypeAlias = CategoricalDistribution | FloatDistribution | IntDistribution
