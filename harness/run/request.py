@@ -158,13 +158,13 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        mismatch, plant, controller = (
-            _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller)
+        mismatch, plant, controller, task = (
+            _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller, self.task)
         )
         varied = "".join(map(_in_name, self.varied)) if self.varied else ""
         robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files(Path(self.robot).name)}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{_fit_for_files(Path(self.sensing).name)}-"
-        return f"{plant}-{robot}{sensing}{controller}-{self.task}-{mismatch}{varied}-{self.seed}"
+        return f"{plant}-{robot}{sensing}{controller}-{task}-{mismatch}{varied}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs.

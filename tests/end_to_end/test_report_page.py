@@ -25,9 +25,11 @@ SMALLEST_TYPE = TEXT - 2.0  # [pt]
 HOSTILE = "</script><script>window.pwned=1</script><img src=x onerror=window.pwned=1>\"'`{{7*7}}"
 FOREIGN_WORDS = re.compile(r"\b(inf|None|NaN|nan|NaT|undefined|null)\b")
 SHOWN_TEXT = "document.body.innerText"
+# A closed list shows its choice shortened and the whole of it when it is open; Chromium 150 counts that as overflow.
 TOO_WIDE = """Array.from(document.querySelectorAll('body *')).filter(e => e.getClientRects().length
   && (e.getBoundingClientRect().right > innerWidth + 0.5 || e.getBoundingClientRect().left < -0.5
-      || (e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0 && getComputedStyle(e).display !== 'inline')))
+      || (e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0 && e.tagName !== 'SELECT'
+          && getComputedStyle(e).display !== 'inline')))
   .map(e => `${e.tagName} ${e.className} ${e.textContent.slice(0, 60)}`)"""
 
 SHORT: str = "24"  # letters of a word that has to stay in one line
@@ -72,16 +74,16 @@ def long_names(folder):
     )
     rows = []
     for seed in range(2):
-        for name in names:
+        for k, name in enumerate(names):
             values = {"controller": name, "seed": seed, "mismatch": "camera_rotation=30deg+links=5%+tool=20mm"}
-            rows.append(made_up_row(f"{name}-{seed}", **values))
+            rows.append(made_up_row(f"{k}-{seed}", **values))
             lost = {
                 "status": "crashed",
                 "outcome": "crashed",
                 "reason": "KeyError: 'x' " * 20,
                 "settling_time_s": np.nan,
             }
-            rows.append(made_up_row(f"{name}-lost-{seed}", task="a_task_with_a_long_name", **values, **lost))
+            rows.append(made_up_row(f"{k}-lost-{seed}", task="a_task_with_a_long_name", **values, **lost))
     return write_folder(folder, rows, [made_up_steps(row["run_id"]) for row in rows])
 
 
