@@ -166,7 +166,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
 
 def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--out", "first", "--set", "exp2.duration=0.2"])
+    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2"])
     assert made.exit_code == 0, made.output
     (tmp_path / "first").symlink_to("results/latest")
     for code in blocks(read("results.md"), "python"):
