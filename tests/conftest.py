@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from functools import cache
 
@@ -54,4 +55,15 @@ def _interrupts_arrive():
 @pytest.fixture(autouse=True)
 def _floating_point_errors_raise():
     with np.errstate(all="raise"):
+        yield
+
+
+@pytest.fixture
+def own_folder(tmp_path, monkeypatch):
+    """Give a test a folder, a path of imports and offers of its own."""
+    from servobench.harness.config.registry import offering
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with offering():
         yield

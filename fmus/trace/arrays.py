@@ -290,7 +290,7 @@ def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> 
     return Traced(Buffer(content), arrange(tables), kind)
 
 
-LARGEST = float(np.finfo(np.float64).max)
+MAX_FLOAT = float(np.finfo(np.float64).max)
 
 
 def _rounded(x: Expression) -> Expression:
@@ -319,7 +319,7 @@ COMPARISONS: Mapping[str, Operation] = {
     "less": lambda x, y: x < y, "less_equal": lambda x, y: x <= y, "greater": lambda x, y: x > y,
     "greater_equal": lambda x, y: x >= y, "equal": lambda x, y: x == y, "not_equal": lambda x, y: x != y,
     "logical_and": casadi.logic_and, "logical_or": casadi.logic_or, "logical_not": casadi.logic_not,
-    "isfinite": lambda x: casadi.fabs(x) <= LARGEST,
+    "isfinite": lambda x: casadi.fabs(x) <= MAX_FLOAT,
     "isnan": lambda x: casadi.logic_not(casadi.fabs(x) <= np.inf),
 }  # fmt: skip
 OF_TRUTH: Mapping[str, str] = {"bitwise_and": "logical_and", "bitwise_or": "logical_or", "invert": "logical_not"}

@@ -6,7 +6,7 @@
 #include <string.h>
 
 /* In continuous time a lag of zero would make the equations algebraic; below this it counts as this. */
-#define SMALLEST_LAG 1e-6
+#define MIN_LAG 1e-6
 /* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
 #define STOP_HYSTERESIS 1e-9
 
@@ -35,7 +35,7 @@ static double clipped_command(const Model *model, size_t i)
 
 static double continuous_lag(const Model *model, size_t i)
 {
-    return fmax(model->values[OFFSET_LAG + i], SMALLEST_LAG);
+    return fmax(model->values[OFFSET_LAG + i], MIN_LAG);
 }
 
 static double upper_room(const Model *model, size_t i)
@@ -272,7 +272,7 @@ static double derive_acceleration(const Model *model, const double *direction, s
 {
     const double lag = continuous_lag(model, i), v = model->values[OFFSET_JOINT_VELOCITY + i];
     const double u = clipped_command(model, i), du = derive_command(model, direction, i);
-    const double dlag = model->values[OFFSET_LAG + i] > SMALLEST_LAG ? direction[OFFSET_LAG + i] : 0.0;
+    const double dlag = model->values[OFFSET_LAG + i] > MIN_LAG ? direction[OFFSET_LAG + i] : 0.0;
     return (du - direction[OFFSET_JOINT_VELOCITY + i]) / lag - (u - v) / (lag * lag) * dlag;
 }
 

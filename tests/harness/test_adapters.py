@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 
 import pandas as pd
 import pytest
@@ -21,14 +20,7 @@ SHORT = {"exp1": {"duration": 0.5}}
 ENTRY = '\n\nENTRY = servobench.PlantEntry("cell", "one line", CellConfig, Cell)\n'
 TWO = CELL + "\n\nclass Other(Cell):\n    pass\n"
 
-
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    """Each test has a folder, a path of imports and offers of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    with offering():
-        yield
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 @pytest.mark.parametrize(

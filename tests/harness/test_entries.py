@@ -12,21 +12,14 @@ from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.batch import trials
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import choose_controller, find_controller, offered, offering
+from servobench.harness.config.registry import choose_controller, find_controller, offered
 from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 TWO = WHOLE + "\n\nclass Other(Mine):\n    pass\n"
 ENTRY = '\n\nENTRY = servobench.ControllerEntry("mine", "one line", MineConfig, Mine)\n'
 
-
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    """Each test has a folder, a path of imports and offers of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    with offering():
-        yield
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ from servobench.plant.contract.signals import Command, Observation, Truth
 LENGTH = 256  # [periods] of the multisine
 AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine
 SETTLING = 100  # [periods] of rest before the experiments
-LARGEST_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
-LOWEST = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
+MAX_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
+MIN_FREQUENCY = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
 POINTS = 400  # of the frequency axis
 NEGLIGIBLE = 1e-6  # [1] a locus that stays below this never matters
 
@@ -113,8 +113,8 @@ class LinearArm(Plant):
         deviation, row, rest, m = self._system.C @ self._x, len(self.measured), self._rest, self._m
         if row < len(self._added):
             deviation = deviation + self._added[row]
-            if not np.abs(deviation[:m]).max() < LARGEST_MOTION:
-                raise ControllerDiverged(f"the loop is unstable: {LARGEST_MOTION} m were exceeded in small motions")
+            if not np.abs(deviation[:m]).max() < MAX_MOTION:
+                raise ControllerDiverged(f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions")
             self.measured.append(deviation)
         time = rest.time + self._k * self._period
         return Observation(time, rest.joint_position + deviation[m:], rest.feature + deviation[:m])
@@ -238,7 +238,7 @@ class Margins:
 def frequencies(period: float, points: int = POINTS) -> FloatArray:
     """Return a logarithmic axis up to the Nyquist frequency, (points,) [rad/s]."""
     nyquist = np.pi / period
-    return np.geomspace(LOWEST * nyquist, nyquist, points)
+    return np.geomspace(MIN_FREQUENCY * nyquist, nyquist, points)
 
 
 @dataclass(frozen=True, eq=False)
