@@ -351,14 +351,14 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         ConfigurationError: a run is asked for twice.
     """
     found = Survey(len(requests))
-    digest, names, seeds = hashlib.sha256(), array("q"), _Ranges()
+    digest, names, seeds = hashlib.sha256(), array("q"), array("q")
     kind: tuple[object, ...] = ()
     seen: set[tuple[object, ...]] = set()
     for request in requests:
         run_id = request.run_id
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
-        seeds.add(request.seed)
+        seeds.append(request.seed)
         condition = (request.mismatch, request.varied, request.robot, request.sensing)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
@@ -373,7 +373,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         found.mismatches[str(example.mismatch)] = found.sensings[example.sensing] = None
         if not find_plant(example.plant).own_robot:
             found.robots[example.robot] = None
-    found.digest, found.seeds = digest.hexdigest(), seeds.merged()
+    found.digest, found.seeds = digest.hexdigest(), _ranges(seeds)
     _refuse_repetition(requests, names)
     return found
 
@@ -389,24 +389,8 @@ def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> No
             raise ConfigurationError(f"the run {name} is asked for twice")
 
 
-class _Ranges:
-    """Collects whole numbers as ranges, which are few where the numbers rise one by one again and again."""
-
-    def __init__(self) -> None:
-        self._begin = self._end = 0
-        self._done: set[tuple[int, int]] = set()
-
-    def add(self, number: int) -> None:
-        if number != self._end:
-            self._done.add((self._begin, self._end))
-            self._begin = number
-        self._end = number + 1
-
-    def merged(self) -> list[range]:
-        merged: list[range] = []
-        for begin, end in sorted({*self._done, (self._begin, self._end)}):
-            if merged and begin <= merged[-1].stop:
-                merged[-1] = range(merged[-1].start, max(end, merged[-1].stop))
-            elif end > begin:
-                merged.append(range(begin, end))
-        return merged
+def _ranges(numbers: array[int]) -> list[range]:
+    """Return whole numbers as ranges, in order."""
+    found = np.unique(np.frombuffer(numbers, dtype=np.int64))
+    parts = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1) if len(found) else []
+    return [range(int(part[0]), int(part[-1]) + 1) for part in parts]

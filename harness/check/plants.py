@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of, report
 from servobench.harness.config.adapters import folder_of
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
@@ -48,11 +48,7 @@ def check_plant(
     """
     with offering():
         entry = find_plant(choose_plant(plant))
-        findings = []
-        for finding in PlantChecks(entry).carry_out(begin):
-            findings.append(finding)
-            found(finding)
-    return Report(entry.name, tuple(findings))
+        return report(entry.name, PlantChecks(entry).carry_out(begin), found)
 
 
 class PlantChecks:

@@ -55,6 +55,15 @@ class Report:
     __repr__ = __str__
 
 
+def report(subject: str, findings: Iterable[Finding], found: Callable[[Finding], None]) -> Report:
+    """Return the findings about a subject; each is handed to `found` as soon as it is there."""
+    kept = []
+    for finding in findings:
+        kept.append(finding)
+        found(finding)
+    return Report(subject, tuple(kept))
+
+
 class CheckFailed(Exception):
     """A check found a defect; the message names the remedy."""
 
