@@ -14,8 +14,8 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of, report
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, at, attributes, differing, watching_draws
-from servobench.harness.config.adapters import folder_of
 from servobench.harness.config.defaults import default_config
+from servobench.harness.config.entries import folder_of
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.plant.contract.faults import ConfigurationError
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of, report
-from servobench.harness.config.adapters import folder_of
+from servobench.harness.config.entries import folder_of
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.signals import Command, Observation
