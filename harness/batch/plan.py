@@ -215,12 +215,17 @@ class SweepPlan:
         axes, settings = [], dict[str, tuple[Value, ...]]()
         for text in variations:
             name, _, values = (part.strip() for part in text.partition("="))
-            if name not in SHORT_NAMES and "." not in name:
-                axes.append(parse_axis(name, values))
-            elif name in settings:
+            if name in settings:
                 raise ConfigurationError(f"--vary gives {name} twice; give all values in one place")
-            else:
-                settings[name] = parse_values(name, values)
+            try:
+                if name in SHORT_NAMES or "." in name:
+                    settings[name] = parse_values(name, values)
+                else:
+                    axes.append((name, parse_magnitudes(name, values)))
+            except ConfigurationError:
+                raise
+            except ValueError as error:
+                raise ConfigurationError(f"--vary: {error}") from error
         in_order = sorted(settings.items(), key=lambda pair: [*SHORT_NAMES, pair[0]].index(pair[0]))
         return cls(batch, tuple(axes), tuple(in_order))
 
@@ -282,34 +287,18 @@ def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
     return mismatch.with_axis(axis, magnitude)
 
 
-def parse_axis(axis: str, values: str) -> tuple[str, tuple[Magnitude, ...]]:
-    """Return an axis and its magnitudes, given as `begin:end:step` (both ends included) or `one/another`.
-
-    The unit stands at the end, as in `0:180:30deg`.
-
-    Raises:
-        ConfigurationError: an unknown axis, or an empty or malformed range.
-    """
-    try:
-        return axis, parse_magnitudes(axis, values)
-    except ValueError as error:
-        raise ConfigurationError(f"--vary: {error}") from error
-
-
 def parse_values(name: str, text: str) -> tuple[Value, ...]:
     """Return the values of a setting: `begin:end:step` (both ends included) or values as in TOML with commas between.
 
     Whole numbers become floats where others are floats, so that a column has one type.
 
     Raises:
-        ConfigurationError: there is no value, one stands there twice, or the range is malformed or empty.
+        ConfigurationError: there is no value, or one stands there twice.
+        ValueError: the range is malformed or empty.
     """
     values: Sequence[Any]
     if re.fullmatch(r"[-+0-9.e]+(:[-+0-9.e]+){2}", text):
-        try:
-            values = parse_range(name, text)
-        except ValueError as error:
-            raise ConfigurationError(f"--vary: {error}") from error
+        values = parse_range(name, text)
     else:
         try:
             values = tomllib.loads(f"values = [{text}]")["values"]
@@ -342,6 +331,11 @@ class Survey:
     examples: list[RunRequest] = field(default_factory=list)
     """With every plant in every condition (mismatch, varied settings) and with every controller, and every task."""
     digest: str = ""  # of all runs in their order
+
+    @property
+    def sections(self) -> list[str]:
+        """The sections of settings that the runs read, apart from `run`."""
+        return [*self.plants, *self.controllers, *self.tasks]
 
 
 def survey(requests: Sequence[RunRequest]) -> Survey:
