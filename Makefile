@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-UNIT := tests/plant tests/controllers tests/fmus tests/harness
 RUNS ?= results/pages
 NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
@@ -12,9 +11,9 @@ run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
 	  --controllers map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
-# For every save: half a minute.
+# For every save: half a minute, without the tests that are marked slow.
 check: lint
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(UNIT)
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow"
 
 # For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
