@@ -24,12 +24,12 @@ test: lint
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 
-# Too long for every change: whether each block of the first pages runs, whether the stored figures of these studies come out again,
+# Too long for every change: whether each block of the first pages runs and all methods do what some do in make test, whether the stored figures of these studies come out again,
 # whether FMPy runs exported loops as the harness does, whether a sweep with hostile controllers loses no run, and whether the unit
 # tests notice small faults in the code; writes nothing into the pages. Unnoticed faults are listed in results/mutation. The tools are
 # in benchmarks/night.
 nightly: $(VENV)/ready
-	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest tests/end_to_end/test_first_hour.py
+	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest $$(grep -rl kit.nightly tests --include 'test_*.py')
 	PYTHONPATH=tests:benchmarks $(BIN)/python -m pytest -p conftest benchmarks/night
 	$(NIGHT).fuzzing --inputs 1000000
 	$(NIGHT).random_calls --calls 10000000

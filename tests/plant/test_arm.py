@@ -3,6 +3,7 @@ import pytest
 import yaml
 
 from kit.plants import factory_ur5, nominal_ur5
+from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.arm import (
     CALIBRATION_BLOCKS,
     SerialArm,
@@ -176,7 +177,10 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
         (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must have shape \(4, 4\), got \(3, 3\)"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])), "X_BC must hold a rotation matrix"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])), "X_BC must hold a rotation matrix"),
-        (lambda: HandEyeModel(ur5_arm(), np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])])), "a rotation matrix"),
+        (
+            lambda: HandEyeModel(stack([ur5_arm()] * 2), np.stack([np.eye(4), -np.eye(4)])),
+            "must hold a rotation matrix",
+        ),
         (lambda: hand_eye_spec(nominal_ur5(), 0.05, -1.0, 6.0), "joint_velocity_limit must be positive"),
         (lambda: hand_eye_spec(nominal_ur5(), 0.05, 1.0, 0.0), "joint_lower must be below joint_upper"),
         (lambda: hand_eye_spec(nominal_ur5(), 0.0, 1.0, 6.0), "period must be positive"),
