@@ -27,6 +27,7 @@ from servobench.harness.config.registry import (
     installed_plant,
     plant_names,
     published,
+    unused_points,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
@@ -73,36 +74,6 @@ class Tried:
 
 class _Trains(BaseException):
     """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
-
-
-def choose_plants(words: Sequence[str]) -> list[str]:
-    """Return the names of plants that a user names, or whose places are given, such as ./cell.py:Cell.
-
-    Raises:
-        ConfigurationError: there is no such plant, or it cannot be used; one line with file and line number.
-    """
-    known = {*plant_names(), *(word for word in words if word.startswith(MAPPED))}
-    return [_choose(choose_plant, PlantEntry, word, word in known) for word in words]
-
-
-def choose_controllers(words: Sequence[str]) -> list[str]:
-    """Return the names of controllers that a user names, or whose places are given, such as ./mine.py:Mine.
-
-    Raises:
-        ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
-    """
-    known = controller_names()
-    return [_choose(choose_controller, ControllerEntry, word, word in known) for word in words]
-
-
-def try_controllers(robot: str = DEFAULT_ROBOT) -> list[Tried]:
-    """Return all controllers; those of third parties are built once for a robot and thrown away."""
-    return _try_all(_Kind("controller", ControllerEntry, find_controller, _build_controller), controller_names(), robot)
-
-
-def try_plants(robot: str = DEFAULT_ROBOT) -> list[Tried]:
-    """Return all plants, with their missing packages; those of third parties are built once and thrown away."""
-    return _try_all(_Kind("plant", PlantEntry, installed_plant, _build_plant), plant_names(), robot)
 
 
 def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Finding], None]) -> None:
@@ -173,22 +144,7 @@ def explain(end: Ending, is_users: Callable[[Path], bool], limit: float) -> str:
     return place + end.reason.replace("the run", "it", 1)
 
 
-def _choose(choose: Choose, entry: type[AnyEntry], word: str, known: bool) -> str:
-    """Choose a controller or plant by its name or place; code of users is imported in a sandbox first."""
-    folder = _folder(entry, word, known)
-    if folder is None:
-        return choose(word)
-    refusals: list[Any] = []
-    end = call(_import, (choose, word), Bounds(IMPORT_LIMIT).limits(1, foreign=True), refusals.append)
-    if refusals:
-        raise ConfigurationError(str(refusals[0]))
-    if end is not None:
-        why = explain(end, lambda path: is_below(path, folder), IMPORT_LIMIT)
-        raise ConfigurationError(f"{word} cannot be imported: {why}")
-    return choose(word)
-
-
-def _folder(entry: type[AnyEntry], word: str, known: bool) -> Path | None:
+def _folder(entry: type[AnyEntry], word: str, known: Sequence[str]) -> Path | None:
     """Return the folder of the code that a word names; None for a name of this package, and for an unknown one.
 
     Raises:
@@ -197,7 +153,7 @@ def _folder(entry: type[AnyEntry], word: str, known: bool) -> Path | None:
     point = published(entry, word)
     if point is not None:
         return folder_of_module(point.module)
-    found = None if known else PLACE.fullmatch(word)
+    found = None if word in known or word.startswith(MAPPED) else PLACE.fullmatch(word)
     if found is None:
         return None
     try:
@@ -207,11 +163,56 @@ def _folder(entry: type[AnyEntry], word: str, known: bool) -> Path | None:
 
 
 @dataclass(frozen=True)
-class _Kind:
+class Kind:
+    """Controllers, or plants.
+
+    Attributes:
+        word: for one of them.
+        entry: its class.
+        names: returns all names.
+        find: returns the entry of a name, if all that it needs is installed.
+        offer: returns the name of a word, and lets one whose place is given be found by its name.
+        build: takes the names of a controller or plant and of a robot.
+    """
+
     word: str
     entry: type[AnyEntry]
+    names: Callable[[], list[str]]
     find: Callable[[str], AnyEntry]
-    build: Callable[[str, str], None]  # takes the names of a controller or plant and of a robot
+    offer: Choose
+    build: Callable[[str, str], None]
+
+    def choose(self, word: str) -> str:
+        """Return the name of one that a user names, or whose place is given, such as ./mine.py:Mine.
+
+        Code of users is imported in a sandbox first.
+
+        Raises:
+            ConfigurationError: there is no such one, or it cannot be used; one line with file and line number.
+        """
+        folder = _folder(self.entry, word, self.names())
+        if folder is None:
+            return self.offer(word)
+        refusals: list[Any] = []
+        end = call(_import, (self.offer, word), Bounds(IMPORT_LIMIT).limits(1, foreign=True), refusals.append)
+        if refusals:
+            raise ConfigurationError(str(refusals[0]))
+        if end is not None:
+            why = explain(end, lambda path: is_below(path, folder), IMPORT_LIMIT)
+            raise ConfigurationError(f"{word} cannot be imported: {why}")
+        return self.offer(word)
+
+    def unused(self) -> list[tuple[str, str]]:
+        """Return the names of entry points that are not used, each with a line that says why."""
+        return unused_points(self.entry)
+
+    def try_all(self, robot: str = DEFAULT_ROBOT) -> list[Tried]:
+        """Return all of them; those of third parties are built once for a robot and thrown away in a sandbox."""
+        names = self.names()
+        points = {name: point for name in names if (point := published(self.entry, name)) is not None}
+        if points:
+            import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
+        return [_try(self, points[name], robot) if name in points else self.try_one(name) for name in names]
 
     def try_one(self, name: str, robot: str | None = None) -> Tried:
         """Return the result of a trial; it is built for a robot if there is one."""
@@ -227,15 +228,7 @@ class _Kind:
         return Tried(name, str(entry.summary))
 
 
-def _try_all(kind: _Kind, names: Sequence[str], robot: str) -> list[Tried]:
-    """Try each one that third parties publish in a sandbox, and look the others up here."""
-    points = {name: point for name in names if (point := published(kind.entry, name)) is not None}
-    if points:
-        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
-    return [_try(kind, points[name], robot) if name in points else kind.try_one(name) for name in names]
-
-
-def _try(kind: _Kind, point: EntryPoint, robot: str) -> Tried:
+def _try(kind: Kind, point: EntryPoint, robot: str) -> Tried:
     """Try one in a sandbox."""
     answers: list[Any] = []
     end = call(_try_here, (kind, point.name, robot), Bounds(TRIAL_LIMIT).limits(1, foreign=True), answers.append)
@@ -247,7 +240,7 @@ def _try(kind: _Kind, point: EntryPoint, robot: str) -> Tried:
     return Tried(point.name, fault=f"{kind.word} {point.name!r} ({point.value}) cannot be used: {why}")
 
 
-def _try_here(argument: tuple[_Kind, str, str], tell: Tell) -> None:
+def _try_here(argument: tuple[Kind, str, str], tell: Tell) -> None:
     """Try one in this process."""
     kind, name, robot = argument
     _print_nowhere()
@@ -339,3 +332,9 @@ def _print_nowhere() -> None:
 def _is_users(path: Path) -> bool:
     inside = any(path.is_relative_to(folder) for folder in (Path(os.__file__).parent, ENGINE))
     return not (inside or PACKAGES in path.parts or str(path).startswith("<"))
+
+
+CONTROLLERS: Final = Kind(
+    "controller", ControllerEntry, controller_names, find_controller, choose_controller, _build_controller
+)
+PLANTS: Final = Kind("plant", PlantEntry, plant_names, installed_plant, choose_plant, _build_plant)
