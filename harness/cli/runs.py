@@ -88,7 +88,7 @@ def run(
     if view and plant != "bullet":
         refuse(f"--view shows the plant bullet only, got --plant {plant}")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
-    name = selection.known_controller(law if estimator is None else f"{law}+{estimator}")
+    name = selection.known("controller", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
     batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
@@ -131,14 +131,14 @@ def train(
     """
     from rich.table import Table
 
-    from servobench.harness.batch.trials import choose_controllers
+    from servobench.harness.batch.trials import choose
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.knowledge import NETWORKS
     from servobench.harness.run.resolution import check_settings
     from servobench.plant.contract.cache import cache_folder
 
-    settings, (controller,) = overrides.settings(), choose_controllers([controller])
+    settings, controller = overrides.settings(), choose("controller", controller)
     check_settings(settings, [controller])
     with telling(console, "training") as tell:
         trained = train_networks(controller, settings, tell, robot, sensing)

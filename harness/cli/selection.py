@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 from servobench.harness.cli.terminal import refuse, say
 
 if TYPE_CHECKING:
-    from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.trials import Tried
-    from servobench.plant.bench.plant import PlantEntry
+    from servobench.harness.batch.trials import Tried, Word
 
 
 def complete_plants(incomplete: str) -> list[str]:
@@ -105,35 +103,31 @@ def known_plant(text: str | None) -> str:
 
     The default is the first of bullet, mujoco and kinematic that is installed.
     """
-    from servobench.harness.batch.trials import choose_plants
     from servobench.harness.config.registry import default_plant
-    from servobench.plant.bench.plant import PlantEntry
 
-    if text is None:
-        name, why = default_plant()
-        if why:
-            say(f"no plant is named, so this run is on {name}: {why}")
-    else:
-        (name,) = choose_plants([text])
-    tell_unused(PlantEntry, [name])
+    if text is not None:
+        return known("plant", text)
+    name, why = default_plant()
+    if why:
+        say(f"no plant is named, so this run is on {name}: {why}")
+    tell_unused("plant", [name])
     return name
 
 
-def known_controller(text: str) -> str:
-    """Return the name of the controller of a run, given by name or file."""
-    from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.trials import choose_controllers
+def known(word: Word, text: str) -> str:
+    """Return the name of the plant or controller of a run, given by name or file."""
+    from servobench.harness.batch.trials import choose
 
-    (name,) = choose_controllers([text])
-    tell_unused(ControllerEntry, [name])
+    name = choose(word, text)
+    tell_unused(word, [name])
     return name
 
 
-def tell_unused(entry: type[ControllerEntry | PlantEntry], named: Sequence[str]) -> None:
+def tell_unused(word: Word, named: Sequence[str]) -> None:
     """Print a line for each entry point that is not used though a user named it, or all."""
-    from servobench.harness.config.registry import ALL, unused_points
+    from servobench.harness.config.registry import ALL, REGISTRIES
 
-    for name, line in unused_points(entry):
+    for name, line in REGISTRIES[word].unused_points():
         if name in named or ALL in named:
             sys.stderr.write(f"servobench: note: {line}\n")
 
@@ -165,28 +159,23 @@ def refuse_repetition(option: str, values: Sequence[object]) -> None:
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of plants given by name or by file, such as ./cell.py:Cell."""
-    from servobench.harness.batch.trials import choose_plants, try_plants
-    from servobench.harness.config.registry import ALL, find_plant, plant_names
-    from servobench.plant.bench.plant import PlantEntry
-
-    known, names = plant_names(), list[str]()
-    for word in split_words(text):
-        names += _usable(try_plants(robot)) if word == ALL else choose_plants([word])
-    tell_unused(PlantEntry, split_words(text))
-    return split_names(option, ",".join(names), known, find_plant)
+    return _split_entries("plant", text, option, robot)
 
 
 def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of controllers given by name or by file, such as ./mine.py:Mine."""
-    from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.trials import choose_controllers, try_controllers
-    from servobench.harness.config.registry import ALL, controller_names, find_controller
+    return _split_entries("controller", text, "controllers", robot)
 
-    known, names = controller_names(), list[str]()
-    for word in split_words(text):
-        names += _usable(try_controllers(robot)) if word == ALL else choose_controllers([word])
-    tell_unused(ControllerEntry, split_words(text))
-    return split_names("controllers", ",".join(names), known, find_controller)
+
+def _split_entries(word: Word, text: str, option: str, robot: str) -> tuple[str, ...]:
+    from servobench.harness.batch.trials import choose, try_all
+    from servobench.harness.config.registry import ALL, REGISTRIES
+
+    registry, names = REGISTRIES[word], list[str]()
+    for part in split_words(text):
+        names += _usable(try_all(word, robot)) if part == ALL else [choose(word, part)]
+    tell_unused(word, split_words(text))
+    return split_names(option, ",".join(names), registry.names(), registry.find)
 
 
 def _usable(all_of_them: Sequence[Tried]) -> list[str]:
