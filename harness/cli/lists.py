@@ -15,7 +15,7 @@ from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.trials import Kind
+    from servobench.harness.batch.trials import Word
 
 DEFAULT_ROBOT = "ur5"
 STANDARD_OUTPUT = Path("-")
@@ -27,14 +27,14 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.batch.trials import PLANTS
+    from servobench.harness.batch.trials import choose
     from servobench.harness.config.registry import find_plant
 
     if name:
-        name = PLANTS.choose(name)
+        name = choose("plant", name)
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
-        _show_names(_tried(PLANTS), as_json=as_json)
+        _show_names(_listed("plant"), as_json=as_json)
 
 
 def controllers(
@@ -43,15 +43,15 @@ def controllers(
 ) -> None:
     """List the controllers, or show the settings of one."""
     from servobench.controllers.parts import ESTIMATORS, LAWS
-    from servobench.harness.batch.trials import CONTROLLERS
+    from servobench.harness.batch.trials import choose
     from servobench.harness.config.defaults import default_config
     from servobench.harness.config.registry import find_controller
 
     if name:
-        name = CONTROLLERS.choose(name)
+        name = choose("controller", name)
         _show_settings(name, default_config(find_controller(name)), as_json=as_json)
         return
-    _show_names(_tried(CONTROLLERS), as_json=as_json)
+    _show_names(_listed("controller"), as_json=as_json)
     if not as_json:
         console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
         console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
@@ -136,13 +136,16 @@ def _described(name: str, summary: str) -> dict[str, str]:
     return {"name": name, "summary": summary}
 
 
-def _tried(kind: Kind) -> list[dict[str, str]]:
+def _listed(word: Word) -> list[dict[str, str]]:
     """Return the names of a kind with their summaries, or with the fault of those that cannot be used."""
+    from servobench.harness.batch.trials import try_all
+    from servobench.harness.config.registry import REGISTRIES
+
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
-        for each in kind.try_all()
+        for each in try_all(word)
     ]
-    return found + [{"name": name, "error": line} for name, line in kind.unused()]
+    return found + [{"name": name, "error": line} for name, line in REGISTRIES[word].unused_points()]
 
 
 def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:

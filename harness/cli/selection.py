@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.cli.terminal import refuse, say
 
 if TYPE_CHECKING:
-    from servobench.harness.batch import trials
+    from servobench.harness.batch.trials import Word
 
 ALL = "all"
 
@@ -21,13 +21,14 @@ class Names(NamedTuple):
     Attributes:
         known: returns all of them.
         find: refuses a wrong word; a text that it returns is the name that the word stands for.
-        tried: kind of which those of third parties are tried before `all` stands for them; None for other kinds.
+        tried: the kind of plants and controllers, of which those of third parties are tried where `all` stands for
+            them; None for other kinds.
         begun: returns the names that a shell offers for a word, where names are put together from parts.
     """
 
     known: Callable[[], Sequence[str]]
     find: Callable[[str], Any]
-    tried: trials.Kind | None = None
+    tried: Word | None = None
     begun: Callable[[str], Iterable[str]] | None = None
 
 
@@ -35,7 +36,8 @@ class Names(NamedTuple):
 def names_of(kind: str) -> Names:
     """Return the names of a kind: plants, controllers, estimators, tasks, mismatch, robot or sensing."""
     from servobench.controllers.parts import ESTIMATORS
-    from servobench.harness.batch.trials import CONTROLLERS, PLANTS
+    from servobench.harness.batch.trials import choose
+    from servobench.harness.config.registry import controller_names, plant_names
     from servobench.harness.config.robots import find_robot, find_sensing, robot_names, sensing_names
     from servobench.harness.run.request import read_mismatch
     from servobench.harness.run.tasks import choose_task, task_names
@@ -48,7 +50,7 @@ def names_of(kind: str) -> Names:
 
     def controllers(word: str) -> Iterable[str]:
         law, plus, _ = word.partition("+")
-        return [f"{law}+{name}" for name in ESTIMATORS] if plus else CONTROLLERS.names()
+        return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
 
     def mismatches(word: str) -> Iterable[str]:
         before, plus, _ = word.rpartition("+")
@@ -56,8 +58,8 @@ def names_of(kind: str) -> Names:
         return axes if plus else [*PROFILES, *axes]
 
     return {
-        "plants": Names(PLANTS.names, PLANTS.choose, PLANTS),
-        "controllers": Names(CONTROLLERS.names, CONTROLLERS.choose, CONTROLLERS, controllers),
+        "plants": Names(plant_names, partial(choose, "plant"), "plant"),
+        "controllers": Names(controller_names, partial(choose, "controller"), "controller", controllers),
         "estimators": Names(lambda: list(ESTIMATORS), str),
         "tasks": Names(task_names, choose_task),
         "mismatch": Names(lambda: list(PROFILES), read_mismatch, begun=mismatches),
@@ -109,12 +111,14 @@ def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tupl
         option: by which it was given, if not by one called as the kind.
         robot: for which plants and controllers of third parties are tried.
     """
+    from servobench.harness.batch.trials import try_all
+
     names = names_of(kind)
 
     def usable() -> Iterable[str]:
         if names.tried is None:
             return names.known()
-        found = names.tried.try_all(robot)
+        found = try_all(names.tried, robot)
         for each in found:
             if each.fault:
                 sys.stderr.write(f"servobench: left out: {each.fault}\n")
@@ -127,7 +131,9 @@ def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tupl
 
 def _tell_unused(names: Names, named: Sequence[str]) -> None:
     """Print a line for each entry point that is not used though a user named it, or all."""
-    for name, line in names.tried.unused() if names.tried else ():
+    from servobench.harness.config.registry import REGISTRIES
+
+    for name, line in REGISTRIES[names.tried].unused_points() if names.tried else ():
         if name in named or ALL in named:
             sys.stderr.write(f"servobench: note: {line}\n")
 
