@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -95,12 +96,12 @@ class Bars(Progress):
         super().__init__(*counts, *further, *times, console=console, disable=not shown)
         self._lines, self._begun = Lines(), 0
 
-    def begin(self, name: str, total: int, done: int = 0, **fields: str) -> TaskID:
+    def begin(self, name: str, total: int, done: int = 0, **fields: Any) -> TaskID:  # noqa: ANN401 - those of rich
         """Begin a bar; `fields` are for the further columns."""
         self._begun += done
         return self.add_task(name, total=total, completed=done, **fields)
 
-    def reach(self, bar: TaskID, done: int, text: str, **fields: str) -> None:
+    def reach(self, bar: TaskID, done: int, text: str, **fields: Any) -> None:  # noqa: ANN401 - those of rich
         """Move a bar; `text` is the line where there are none."""
         self.update(bar, completed=done, **fields)
         if not self.console.is_terminal:
