@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import MISSING, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar, cast
 
 import numpy as np
 from annotated_types import MinLen
@@ -144,7 +144,9 @@ def make_mapping(kind: type[Roles], path: Path, table: Mapping[str, Any]) -> Rol
     Raises:
         ValueError: a missing or unknown key, or a value of the wrong kind.
     """
-    needed = [each.name for each in fields(kind) if each.default is MISSING and each.default_factory is MISSING]
+    needed = [
+        each.name for each in fields(cast(Any, kind)) if each.default is MISSING and each.default_factory is MISSING
+    ]
     for key in needed:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
