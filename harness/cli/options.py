@@ -20,7 +20,7 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.terminal import refuse
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.plan import Batch
     from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
@@ -263,11 +263,11 @@ class Running(Place):
         False
     )
 
-    def execution(self, observer: Observer | None = None) -> Execution:
+    def execution(self) -> Execution:
         """Return it as the driver takes it."""
-        from servobench.harness.batch.campaign import Execution, Observer
+        from servobench.harness.batch.campaign import Execution
 
-        return Execution(self.workers, self.scheduler, self.bounds(), self.resume, observer or Observer())
+        return Execution(self.workers, self.scheduler, self.bounds(), self.resume)
 
 
 @dataclass(frozen=True)

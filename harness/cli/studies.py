@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,9 +55,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    how = judging.execution(running)
-    with watching(console, out, bar=not how.debug) as observer:
-        carry_out(campaign, out, replace(how, observer=observer))
+    with watching(console, out, judging.execution(running)) as how:
+        carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
@@ -93,8 +91,7 @@ def robustness(
     lines = find_lines(selection.split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
-    with watching(console, out) as observer:
-        how = running.execution(observer)
+    with watching(console, out, running.execution()) as how:
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
     say(f"the map is in {files[0]}; its runs are in {out}")
 
@@ -134,8 +131,8 @@ def claims(
     names = selection.split("plants", plants)
     divisions = find_divisions(division)
     wanted = None if check is None else read_answers(check)
-    with watching(console, out) as observer:
-        answers = reproduce(out, names, seeds, running.execution(observer), divisions)
+    with watching(console, out, running.execution()) as how:
+        answers = reproduce(out, names, seeds, how, divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
         verdict = answer.verdict + elsewhere(answer, answers)
