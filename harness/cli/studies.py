@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option
@@ -102,7 +102,7 @@ def claims(
     plants: options.PlantsOption = "kinematic,fmu",
     seeds: Annotated[int, option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
-        str,
+        Literal["equipped", "published", "both"],
         option(
             "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
         ),
@@ -118,7 +118,7 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.claims import find_divisions
+    from servobench.harness.studies.claims import DIVISIONS
     from servobench.harness.studies.reproduction import (
         ANSWERS,
         FIGURES,
@@ -129,7 +129,7 @@ def claims(
     )
 
     names = selection.split("plants", plants)
-    divisions = find_divisions(division)
+    divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
     wanted = None if check is None else read_answers(check)
     with watching(console, out, running.execution()) as how:
         answers = reproduce(out, names, seeds, how, divisions)
