@@ -9,7 +9,8 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import option
-from servobench.harness.cli.terminal import console, print_tables, refuse, say, writing
+from servobench.harness.cli.terminal import console, print_tables, say, writing
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +49,6 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.contract.faults import RunFault
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
@@ -59,7 +59,7 @@ def analyse(
             except RunFault as fault:
                 say(f"{run.request.controller}: {fault}")
     if not loops:
-        refuse("no loop is left to analyse")
+        raise ConfigurationError("no loop is left to analyse")
     table = loop_table(loops)
     if simulate:
         chosen = {run.request.controller: run for run in runs}

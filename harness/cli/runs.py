@@ -11,7 +11,9 @@ import typer
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import console, print_rows, print_tables, refuse, say
+from servobench.harness.cli.terminal import console, print_rows, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import point_latest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,11 +80,11 @@ def run(
     from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
-        refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
+        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     plant = _default_plant() if plant is None else plant
     plant = selection.choose("plants", plant)
     if view and plant != "bullet":
-        refuse(f"--view shows the plant bullet only, got --plant {plant}")
+        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.choose("controllers", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
@@ -116,7 +118,7 @@ def compare(
 
     batch = combinations.batch()
     if running.resume and out is None:
-        refuse("--resume needs --out, the folder to continue in")
+        raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
     _carry_out(campaign, out, judging.execution(running), with_report=with_report, strict=judging.strict)
 
@@ -171,8 +173,6 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
     from servobench.harness.pictures.figures import draw_figures
-    from servobench.plant.contract.faults import ConfigurationError
-    from servobench.plant.contract.files import point_latest
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, refuse, say
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -192,7 +193,7 @@ def tune(
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
-        refuse(str(error))
+        raise ConfigurationError(str(error)) from error
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
