@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import operator
-import pickle
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,11 +13,11 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
+from servobench.harness.batch.blocks import can_travel
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import Batch, Cell, Grid
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
-from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
+from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
@@ -82,7 +80,7 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        place = _plant_name(plant), _name(controller), _task_name(task), read_mismatch(mismatch), seed
+        place = choose_plant(plant), choose_controller(controller), _task_name(task), read_mismatch(mismatch), seed
         request = RunRequest(*place, robot=robot, sensing=sensing)
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
@@ -140,11 +138,11 @@ def compare(
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
-        names = tuple(_name(each) for each in controllers)
-        worlds = tuple(_plant_name(each) for each in plants)
+        names = tuple(choose_controller(each) for each in controllers)
+        worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
-        if not _can_travel(offered([*worlds, *names, *batch.tasks])):
+        if not can_travel(offered([*worlds, *names, *batch.tasks])):
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)
 
@@ -196,24 +194,5 @@ def load(folder: Path | str) -> Results:
     return Results(runs, steps, results.read_manifest(path))
 
 
-def _name(given: AnyController) -> str:
-    """Return the name by which a controller is found, one given as an object from now on."""
-    return choose_controller(given) if isinstance(given, str) else offer(own_object(CONTROLLER, given))
-
-
-def _plant_name(given: AnyPlant) -> str:
-    """Return the name by which a plant is found, one given as an object from now on."""
-    return choose_plant(given) if isinstance(given, str) else offer(own_object(PLANT, given))
-
-
 def _task_name(given: str) -> str:
     return choose_task(given) if isinstance(given, str) else given  # a request refuses the others
-
-
-def _can_travel(own: tuple[Offer, ...]) -> bool:
-    """Return whether a worker process can receive these controllers and plants."""
-    try:
-        text = pickle.dumps(own)
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return False
-    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")
