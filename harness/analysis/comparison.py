@@ -101,14 +101,19 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
     A task of which no run could be built has no kind and is in neither.
     """
-    kinds = runs.reindex(columns=["task_kind"])["task_kind"]
+    kinds = texts_of(runs, "task_kind")
     moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"])] for kind in TASK_KINDS)
     return moves, curves
 
 
-def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
     """Return a column of the table of runs, NaN throughout where the table has none of this name."""
-    return runs.reindex(columns=[name])[name].astype(float)
+    return runs.reindex(columns=[name])[name]
+
+
+def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+    """Return a column of numbers of the table of runs, likewise."""
+    return texts_of(runs, name).astype(float)
 
 
 def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
@@ -128,7 +133,7 @@ def achieved_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estima
 
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
-    curve = runs.reindex(columns=["task_kind"])["task_kind"] == CURVE
+    curve = texts_of(runs, "task_kind") == CURVE
     follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
     on_curve, moved = (
         np.where(follows, FOLLOWED, NOT_FOLLOWED),
@@ -136,7 +141,7 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     )
     guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
     guessed = guessed.where(runs["status"] == COMPLETED, runs["status"])
-    told = runs.reindex(columns=["outcome"])["outcome"].astype(object)
+    told = texts_of(runs, "outcome").astype(object)
     return told.where(told.notna(), guessed).rename("outcome").astype(str)
 
 
@@ -150,13 +155,16 @@ def handy_unit(feature_unit: str | None) -> tuple[str, float]:
     return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
 
 
+def error_unit(runs: pd.DataFrame) -> tuple[str, float]:
+    """Return the unit in which errors of these runs are shown, and the factor to it from that of the feature."""
+    units = texts_of(runs, "feature_unit").dropna().unique().tolist()
+    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
+
+
 def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     """Return the unit in which a metric of these runs is shown, and the factor to it."""
     metric = METRICS[name]
-    if metric.unit:
-        return metric.shown_unit, metric.factor
-    units = runs.reindex(columns=["feature_unit"])["feature_unit"].dropna().unique().tolist()
-    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
+    return (metric.shown_unit, metric.factor) if metric.unit else error_unit(runs)
 
 
 def metric_heading(name: str, runs: pd.DataFrame) -> str:
@@ -167,7 +175,7 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
     """Return runs of several units with the errors of each in its handy one; runs of one unit as they are."""
-    units = runs.reindex(columns=["feature_unit"])["feature_unit"]
+    units = texts_of(runs, "feature_unit")
     if units.nunique() < 2:
         return runs
     handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]

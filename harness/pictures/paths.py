@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.style import DESIRED, END_MARK, LETTER, WIDE, Layout, Styles, add_legend, divisions
+from servobench.harness.pictures.style import DESIRED, LETTER, WIDE, Layout, Styles, add_legend, divisions, mark_end
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
@@ -152,7 +152,7 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
         if len(points):
             axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
             if not track.completed:
-                axes.plot(*points[-1:].T, color=styles[name].colour, **END_MARK)
+                mark_end(axes, *points.T, styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
     axes.plot(*start.T, color="black", marker="s", markersize=6, markerfacecolor="white", markeredgewidth=1.3,
               linestyle="", label="start", zorder=10)  # fmt: skip
