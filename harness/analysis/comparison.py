@@ -72,16 +72,17 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
             words += f", noise × {values['noise_factor']:g}"
         for name, (heading, factor) in varied.items():
             if name != "noise_factor" and not pd.isna(values[name]):
-                words += f", {_in_words(heading, values[name], factor)}"
+                quantity, _, unit = heading.removesuffix("]").partition(" [")
+                words += f", {quantity} {shown_value(values[name], factor)}{f' {unit}' * bool(unit)}"
         found.append((words, group))
     return found
 
 
-def _in_words(heading: str, value: Any, factor: float) -> str:  # noqa: ANN401 - a cell of the table of runs
-    """Return a value with the name and the unit of its heading, such as `latency 50 ms`."""
-    name, _, unit = heading.removesuffix("]").partition(" [")
-    shown = f"{factor * value:g}" if isinstance(value, float) else str(value)
-    return f"{name} {shown}{f' {unit}' * bool(unit)}"
+def shown_value(value: Any, factor: float = 1.0, missing: str = "as configured") -> str:  # noqa: ANN401 - a cell
+    """Return the value of a condition as text: a number times the factor to the unit in which it is shown."""
+    if pd.isna(value):
+        return missing
+    return f"{factor * value:g}" if isinstance(value, float) else str(value)
 
 
 def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs

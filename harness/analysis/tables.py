@@ -24,6 +24,7 @@ from servobench.harness.analysis.comparison import (
     settling_band,
     settling_times,
     shown_unit,
+    shown_value,
     split_conditions,
     split_tasks,
     with_places,
@@ -62,7 +63,6 @@ SWEEP_COLUMNS: Final = (
 )  # columns that `sweep_tables` and `outcome_legend` read
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
-SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     for part in parts:
         counted.append(_count_outcomes(part))
         curves |= set(split_tasks(part)[1]["task"])
-    keys = _sweep_keys(counted[0])
+    keys = list(counted[0].columns[:-2])
     counts = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
@@ -256,29 +256,15 @@ def _percent(value: float) -> str:
 
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return how many runs of each condition had which outcome."""
-    runs = with_places(runs).assign(
-        outcome=outcomes(runs),
-        noise=runs["noise_factor"].map("{:g}".format),
-        latency=_milliseconds(runs["latency_s"]),
-        period=_milliseconds(runs["period_s"]),
-        **{name: runs[name].map(_in_short) for name in runs.columns if name.startswith(SECTIONS)},
-    )
-    return runs.groupby([*_sweep_keys(runs), "outcome"], sort=False).size().rename("runs").reset_index()
-
-
-def _sweep_keys(runs: pd.DataFrame) -> list[str]:
-    """Return the columns that say which runs are counted together, the controller last."""
-    *keys, controller = SWEEP_KEYS
-    return [*keys, *(name for name in runs.columns if name.startswith(SECTIONS)), controller]
-
-
-def _in_short(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _milliseconds(times: pd.Series[float]) -> list[str]:
-    return [MISSING if pd.isna(time) else f"{1e3 * time:g}" for time in times]
+    """Return how many runs of each condition had which outcome: plant, task, conditions, controller, outcome, runs."""
+    varied = {name: (short.column, short.scale) for name, short in SHORT_NAMES.items()}
+    varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
+    texts = {
+        name: [shown_value(value, scale, MISSING) for value in runs[column]] for name, (column, scale) in varied.items()
+    }
+    keys = ["plant", "task", "mismatch", *varied, "controller", "outcome"]
+    named = with_places(runs).assign(outcome=outcomes(runs), **texts)
+    return named.groupby(keys, sort=False).size().rename("runs").reset_index()
 
 
 def _is_late(runs: pd.DataFrame) -> bool:
