@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -139,7 +139,7 @@ def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
     )
 
 
-class Replay:
+class Replay(AbstractContextManager["Replay"]):
     """The scene in which a logged run is shown; to be used in a `with` statement."""
 
     def __init__(self, run: LoggedRun, *, fineness: float = 1.0) -> None:
@@ -157,11 +157,7 @@ class Replay:
         self._pose = self._poses[0]
         self._overview = Overview.of(run.robot.workspace.scale, fineness)
 
-    def __enter__(self) -> Self:
-        """Return the replay."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the world."""
         self._scene.close()
 
