@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.statistics import (
-    CONFIDENCE,
     Estimate,
     holm,
     median_with_interval,
@@ -122,14 +121,14 @@ def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
     return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
 
 
-def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+def settled_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled, in percent, with the Wilson interval."""
-    return success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence).scaled(100.0)
+    return success_rate(int(settling_times(runs).notna().sum()), len(runs)).scaled(100.0)
 
 
-def achieved_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+def achieved_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled or followed their curve, in percent, with the Wilson interval."""
-    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs), confidence).scaled(100.0)
+    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs)).scaled(100.0)
 
 
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
@@ -202,8 +201,6 @@ def compare_pairs(
     never: float,
     metric: str = "settling_time_s",
     keys: Sequence[str] = KEYS,
-    seed: int = 0,
-    confidence: float = CONFIDENCE,
 ) -> list[Comparison]:
     """Compare controllers on the runs that they share, and correct for the number of comparisons.
 
@@ -216,8 +213,6 @@ def compare_pairs(
         never: the value of a run that has none or did not complete; for settling times the duration [s].
         metric: the column compared, less is better.
         keys: columns that two runs of a pair share.
-        seed: of the bootstrap interval of the median difference.
-        confidence: of that interval.
 
     Raises:
         ValueError: no pair, two controllers without a common run, or two runs of a controller with the same keys.
@@ -228,9 +223,7 @@ def compare_pairs(
     p_values = [signed_rank_p_value(difference) for difference in differences]
     corrected = holm(p_values)
     return [
-        Comparison(
-            *pair, median_with_interval(difference, seed=seed, confidence=confidence), p_value, float(corrected_p_value)
-        )
+        Comparison(*pair, median_with_interval(difference), p_value, corrected_p_value)
         for pair, difference, p_value, corrected_p_value in zip(pairs, differences, p_values, corrected, strict=True)
     ]
 

@@ -154,43 +154,28 @@ class ArmModel:
         States: q, v, the commands u(k−1), u(k−2), … under way, and q at the exposure between the last two instants
         where the latency has a part of a period.
         """
-        dt = self.period
-        waiting, part = split(self.command_delay, dt)
-        _, early = split(self.latency, dt)
+        waiting, part = split(self.command_delay, self.period)
+        _, early = split(self.latency, self.period)
         queue = waiting + (part > 0.0)
-        until_now = self._advance(dt, waiting, part)
-        size = 2 + queue + (early > 0.0)
-        A, B, C = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((2, size))
-        A[:2, : 2 + queue], B[:2] = until_now
-        for i in range(queue):
-            A[2 + i, 1 + i], B[2 + i] = float(i > 0), float(i == 0)
+        every = np.eye(3 + queue + (early > 0.0))  # a row for each state, and the last one for u(k)
+        position, motion, commands = every[0], every[:2], np.vstack([every[-1], every[2 : 2 + queue]])
+
+        def after(time: float) -> FloatArray:
+            """Return q and v `time` [s] into the period, of which the command of the period before has its part."""
+            state, before = motion, min(time, part)
+            for span, command in ((before, commands[-1]), (time - before, commands[waiting])):
+                if span > 0.0:
+                    A, b = discretise_lag(self.lag, span)
+                    state = A @ state + np.outer(b, command)
+            return state
+
+        rows = [after(self.period), commands[:queue]]
+        exposed = position
         if early > 0.0:
-            from_state, from_command = self._advance(dt - early, waiting, part)
-            A[-1, : 2 + queue], B[-1] = from_state[0], from_command[0]
-        C[0, -1 if early > 0.0 else 0], C[1, 0] = 1.0, 1.0
-        return StateSpace(A, B, C, np.zeros((2, 1)))
-
-    def _advance(self, time: float, waiting: int, part: float) -> _Advance:
-        """Return how (q, v) `time` [s] into a period follow from q, v, the waiting commands, and u(k)."""
-        queue = waiting + (part > 0.0)
-        before = min(time, part)  # the command of the period before still acts
-        first, by_first = discretise_lag(self.lag, before) if before > 0.0 else (np.eye(2), np.zeros(2))
-        after = time - before
-        then, by_then = discretise_lag(self.lag, after) if after > 0.0 else (np.eye(2), np.zeros(2))
-        state, command = np.zeros((2, 2 + queue)), np.zeros((2, 1))
-        state[:, :2] = then @ first
-        if part > 0.0:
-            state[:, 2 + waiting] += then @ by_first
-        if waiting:
-            state[:, 1 + waiting] += by_then
-        else:
-            command[:, 0] = by_then
-        return _Advance(state, command)
-
-
-class _Advance(NamedTuple):
-    from_state: FloatArray  # (2, 2 + queue)
-    from_command: FloatArray  # (2, 1)
+            rows.append(after(self.period - early)[:1])
+            exposed = every[-2]
+        new = np.vstack(rows)
+        return StateSpace(new[:, :-1], new[:, -1:], np.vstack([exposed, position])[:, :-1], np.zeros((2, 1)))
 
 
 def split(delay: float, period: float) -> tuple[int, float]:
