@@ -155,16 +155,13 @@ def handy_unit(feature_unit: str | None) -> tuple[str, float]:
     return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
 
 
-def error_unit(runs: pd.DataFrame) -> tuple[str, float]:
-    """Return the unit in which errors of these runs are shown, and the factor to it from that of the feature."""
-    units = texts_of(runs, "feature_unit").dropna().unique().tolist()
-    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
-
-
 def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     """Return the unit in which a metric of these runs is shown, and the factor to it."""
     metric = METRICS[name]
-    return (metric.shown_unit, metric.factor) if metric.unit else error_unit(runs)
+    if metric.unit:
+        return metric.shown_unit, metric.factor
+    units = texts_of(runs, "feature_unit").dropna().unique().tolist()
+    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
 
 
 def metric_heading(name: str, runs: pd.DataFrame) -> str:

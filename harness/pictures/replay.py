@@ -19,7 +19,7 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
-from servobench.harness.pictures.tracks import Track
+from servobench.harness.pictures.tracks import Track, track_of
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -91,9 +91,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         raise ConfigurationError(f"run {run_id} cannot be shown: films have the sensing position, not {sensing}")
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
-    track = Track(row, steps.reset_index(drop=True))
+    track = track_of(row, steps)
     robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
-    names = [str(name) for name in steps if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
+    names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
     if len(names) != robot.arm.n:
         raise ConfigurationError(
             f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
@@ -104,7 +104,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
     except (ValueError, TypeError) as error:
         raise ConfigurationError(f"run {run_id}: settings of the camera in the manifest: {error}") from error
-    q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
+    q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
     def in_base(points: FloatArray) -> FloatArray:

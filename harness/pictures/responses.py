@@ -42,6 +42,7 @@ from servobench.harness.pictures.tracks import (
     WINDOW,
     Ensemble,
     Ensembles,
+    Shown,
     Track,
     Tracks,
     each,
@@ -258,7 +259,7 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
-def mark_settling_band(axes: Axes, runs: Track | Ensemble) -> None:
+def mark_settling_band(axes: Axes, runs: Shown) -> None:
     """Draw the error within which a run counts as settled, where the table of runs has it."""
     if math.isfinite(runs.settling_band):
         label = f"settling band, {runs.settling_band:g} {runs.error_unit[0]}"

@@ -11,15 +11,13 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import (
     POINT_TO_POINT,
-    column_of,
-    error_unit,
     handy_unit,
     settling_times,
     texts_of,
@@ -44,15 +42,40 @@ MIN_SHARE = 0.2  # of a run that a figure shows at least
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """The steps of one run.
+class Shown:
+    """What is shown of runs of a task, as their row in the table of runs says.
 
     Attributes:
-        row: its row in the table of runs.
-        table: its steps, at least one; columns without any value are left out.
+        row: of the run, or of the first one.
     """
 
     row: Mapping[str, Any]
+
+    @property
+    def point_to_point(self) -> bool:
+        """Whether the task has a fixed target."""
+        return bool(self.row.get("task_kind") == POINT_TO_POINT)
+
+    @property
+    def error_unit(self) -> tuple[str, float]:
+        """The unit in which errors are shown, and the factor to it from that of the feature."""
+        return handy_unit(self.row.get("feature_unit"))
+
+    @property
+    def settling_band(self) -> float:
+        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
+        return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Track(Shown):
+    """The steps of one run.
+
+    Attributes:
+        table: its steps, at least one; columns without any value are left out.
+    """
+
     table: pd.DataFrame
 
     @property
@@ -70,21 +93,6 @@ class Track:
         """Names of the features with their unit, such as `x_m`."""
         names = [name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE)]
         return [name for name in names if f"reference_{name}" in self.table.columns]
-
-    @property
-    def point_to_point(self) -> bool:
-        """Whether the reference rests."""
-        return bool(np.ptp(self.vectors("reference_"), axis=0).max(initial=0.0) == 0.0)
-
-    @property
-    def error_unit(self) -> tuple[str, float]:
-        """The unit in which errors are shown, and the factor to it from that of the feature."""
-        return handy_unit(self.row.get("feature_unit"))
-
-    @property
-    def settling_band(self) -> float:
-        """The error within which the run counts as settled [`error_unit`]; NaN if the table has none."""
-        return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
 
     @property
     def long(self) -> bool:
@@ -171,10 +179,14 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
         for track in _load_tracks(folder, chosen):
-            known = track.table.dropna(axis=1, how="all").reset_index(drop=True)
-            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = Track(track.row, known)
+            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = track_of(track.row, track.table)
         if tasks:  # a sweep keeps no steps, and a run may end before its first
             yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
+
+
+def track_of(row: Mapping[str, Any], steps: pd.DataFrame) -> Track:
+    """Return the track of a run whose steps come from a table with columns of other runs."""
+    return Track(row, steps.dropna(axis=1, how="all").reset_index(drop=True))
 
 
 def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
@@ -216,8 +228,9 @@ def label_of(feature: str) -> str:
     return f"{name} [{unit}]"
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed.
 
     Attributes:
@@ -240,21 +253,6 @@ class Ensemble:
     def period(self) -> float:
         """Control period [s]; NaN of a run of one period."""
         return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
-
-    @property
-    def point_to_point(self) -> bool:
-        """Whether the task has a fixed target."""
-        return bool((texts_of(self.runs, "task_kind") == POINT_TO_POINT).any())
-
-    @property
-    def error_unit(self) -> tuple[str, float]:
-        """The unit in which errors are shown, and the factor to it from that of the feature."""
-        return error_unit(self.runs)
-
-    @property
-    def settling_band(self) -> float:
-        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
-        return self.error_unit[1] * float(column_of(self.runs, "settling_band").iloc[0])
 
     @property
     def settling_time(self) -> float:
@@ -327,6 +325,7 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
 
     times = np.concatenate([track.column(STEP_TIME) for track in tracks])
     return Ensemble(
+        tracks[0].row,
         runs,
         time,
         np.stack([padded(track, track.error(), math.nan if track.completed else math.inf) for track in few]),
