@@ -233,7 +233,6 @@ class LoopAnalysis:
         margins: of the loop.
         response: the frequency response of controller and loop.
         step: each feature after a unit step of its own reference, (periods, m).
-        system: the closed loop from the references to the measured signals; None for an identified one.
     """
 
     name: str
@@ -242,7 +241,6 @@ class LoopAnalysis:
     margins: Margins
     response: LoopResponse
     step: FloatArray
-    system: StateSpace | None
 
     @property
     def arm(self) -> ArmModel:
@@ -372,7 +370,7 @@ def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
     controller, arm = linear_controller(warm, source), warm.arm
     closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
     step = closed.step(len(arm.jacobian), round(STEP_DURATION / arm.period))
-    return LoopAnalysis(name, "linearised", is_stable(closed.A), response.margins(), response, step, closed)
+    return LoopAnalysis(name, "linearised", is_stable(closed.A), response.margins(), response, step)
 
 
 def _identified(name: str, warm: Warm) -> LoopAnalysis:
@@ -382,7 +380,7 @@ def _identified(name: str, warm: Warm) -> LoopAnalysis:
     frequency, controller = controller_response(excite(loop, m + n), arm.period)
     response = LoopResponse(frequency, controller, arm)
     step = step_responses(loop, m, n, round(STEP_DURATION / arm.period))
-    return LoopAnalysis(name, "identified", True, response.margins(), response, step, None)
+    return LoopAnalysis(name, "identified", True, response.margins(), response, step)
 
 
 def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
