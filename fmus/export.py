@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Final
 
+import casadi
 import numpy as np
 
-from servobench.fmus.compiler import Platform, this_platform
+from servobench.fmus.compiler import CODE, Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections
 from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
 from servobench.fmus.reference import COMMAND, reference_run, table
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import SetupModel
-from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.registry import SETUPS, Sensing
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
@@ -23,6 +26,8 @@ from servobench.plant.robot.ur5 import UR5
 
 MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
+PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
+SOURCES: Final = {".py", ".c", ".h", ".html", ".txt"}
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
 
@@ -110,12 +115,26 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
 
 
 def fingerprint(options: ExportOptions) -> str:
-    """Return a hash of all that determines the behaviour of the FMU; see `Product.fingerprint`."""
-    return product(options, documented=False).fingerprint(options.platforms)
+    """Return a hash of all that an FMU is made from, without making it.
+
+    These are the files of the packages `fmus` and `plant`, the exporter's and CasADi's version, the options and their
+    numbers, and of a set-up that is not one of `plant.cameras` its equations.
+    """
+    view = options.view
+    parts: list[object] = [tool(), casadi.__version__, CODE, options.platforms, options.fmi_version]
+    parts += [options.title, options.identifier, options.summary]
+    if view is not None and view.setup not in SETUPS.values():
+        parts += [options.layout.groups, kinematics_source(options.layout)]
+    digest = hashlib.sha256(repr(parts).encode())
+    for name, values in parameters_of(options.model, options.actuation).items():
+        digest.update(name.encode() + np.asarray(values).tobytes())
+    for path in sorted(path for folder in PACKAGES for path in folder.rglob("*") if path.suffix in SOURCES):
+        digest.update(str(path.relative_to(PACKAGES[0].parent)).encode() + path.read_bytes())
+    return digest.hexdigest()[:32]
 
 
-def product(options: ExportOptions, *, documented: bool = True) -> Product:
-    """Return the content of the FMU; documentation and reference run only where it is to be `documented`."""
+def product(options: ExportOptions) -> Product:
+    """Return the content of the FMU."""
     layout, start = options.layout, parameters_of(options.model, options.actuation)
     description = Description(
         model_name=options.title,
@@ -127,10 +146,7 @@ def product(options: ExportOptions, *, documented: bool = True) -> Product:
         sources=c_files(options.fmi_version, CORE),
         tool=tool(),
     )
-    reference = ("", "")
-    if documented:
-        run = reference_run(options.model, options.actuation)
-        reference = table(run.time, {COMMAND: run.command}, layout), table(run.time, run.outputs, layout)
+    run = reference_run(options.model, options.actuation)
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
@@ -138,8 +154,8 @@ def product(options: ExportOptions, *, documented: bool = True) -> Product:
         source=kinematics_source(layout),
         constants=arm_constants(layout),
         description=description,
-        documentation=_documentation(layout, options) if documented else "",
-        reference=reference,
+        documentation=_documentation(layout, options),
+        reference=(table(run.time, {COMMAND: run.command}, layout), table(run.time, run.outputs, layout)),
     )
 
 

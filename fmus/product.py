@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from servobench.fmus.compiler import CODE, Platform, compile_library, library_files
+from servobench.fmus.compiler import Platform, compile_library, library_files
 from servobench.fmus.model_description import (
     REFERENCES,
     Description,
@@ -115,14 +115,6 @@ class Product:
             "documentation/index.html": self.documentation,
             "documentation/licenses/license.txt": committed("ur5_mismatched", "license.txt"),
         }
-
-    def fingerprint(self, platforms: tuple[Platform, ...]) -> str:
-        """Return a hash of all that determines the behaviour of the FMU: sources, descriptions, compilation."""
-        contents = {name: text.encode() for name, text in self.sources().items()}
-        contents |= self.descriptions(PLACEHOLDER)
-        for platform in platforms:
-            contents[f"binaries/{platform.name}"] = repr((CODE, platform)).encode()
-        return _token(contents)
 
     def write(self, path: Path, platforms: tuple[Platform, ...]) -> Path:
         """Write the FMU atomically.

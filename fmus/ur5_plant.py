@@ -65,7 +65,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
     """
     options = nominal_options(fmi_version, robot or find_robot(UR5), sensing)
     name = f"{options.identifier}.fmu"
-    key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options).strip('{}')}"
+    key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options)}"
     return cached("fmus", key, lambda folder: export_fmu(folder / name, options)) / name
 
 

@@ -18,8 +18,7 @@ from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import Batch, Cell, Grid
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
-from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
+from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
@@ -82,7 +81,7 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        place = _plant_name(plant), _name(controller), _task_name(task), read_mismatch(mismatch), seed
+        place = choose_plant(plant), choose_controller(controller), _task_name(task), read_mismatch(mismatch), seed
         request = RunRequest(*place, robot=robot, sensing=sensing)
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
@@ -140,8 +139,8 @@ def compare(
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
-        names = tuple(_name(each) for each in controllers)
-        worlds = tuple(_plant_name(each) for each in plants)
+        names = tuple(choose_controller(each) for each in controllers)
+        worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
         if not _can_travel(offered([*worlds, *names, *batch.tasks])):
@@ -194,16 +193,6 @@ def load(folder: Path | str) -> Results:
     runs = results.load_runs(path)
     steps = results.load_steps(path) if results.has_steps(path) else None
     return Results(runs, steps, results.read_manifest(path))
-
-
-def _name(given: AnyController) -> str:
-    """Return the name by which a controller is found, one given as an object from now on."""
-    return choose_controller(given) if isinstance(given, str) else offer(own_object(CONTROLLER, given))
-
-
-def _plant_name(given: AnyPlant) -> str:
-    """Return the name by which a plant is found, one given as an object from now on."""
-    return choose_plant(given) if isinstance(given, str) else offer(own_object(PLANT, given))
 
 
 def _task_name(given: str) -> str:

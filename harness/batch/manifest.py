@@ -10,15 +10,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import git_commit, installed_version
-from servobench.harness.config.registry import MAPPED, Offer, find_plant, published
+from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
 from servobench.harness.config.robots import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
-from servobench.harness.run.tasks import published_task
-from servobench.plant.bench.plant import PlantEntry
+from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.mismatch import Mismatch
@@ -90,9 +88,9 @@ def describe_batch(
 
 def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield names of controllers, plants and tasks that others have installed, and the record of each."""
-    points = {name: published(ControllerEntry, name) for name in runs.controllers}
-    points |= {name: published(PlantEntry, name) for name in runs.plants}
-    points |= {name: published_task(name) for name in runs.tasks}
+    points = {name: CONTROLLER_REGISTRY.published(name) for name in runs.controllers}
+    points |= {name: PLANT_REGISTRY.published(name) for name in runs.plants}
+    points |= {name: TASK_REGISTRY.published(name) for name in runs.tasks}
     for name, point in points.items():
         if point is not None:
             made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"

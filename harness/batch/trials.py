@@ -12,22 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from servobench.controllers.controller import ControllerEntry
-from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.processes import FOREIGN_TIME, Bounds
 from servobench.harness.batch.sandbox import LOST, Tell, call
 from servobench.harness.check.report import Finding
-from servobench.harness.config.registry import (
-    MAPPED,
-    choose_controller,
-    choose_plant,
-    controller_names,
-    find_controller,
-    installed_plant,
-    plant_names,
-    published,
-)
+from servobench.harness.config.registry import MAPPED, REGISTRIES, Registry, find_controller, installed_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import PACKAGES, PLACE, folder_of_module, is_below, place_in_trace
@@ -36,7 +26,7 @@ from servobench.harness.run.request import RunRequest, RunSettings, read_mismatc
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.harness.run.tasks import task_names
-from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault
 from servobench.plant.contract.files import user_path
 
@@ -51,8 +41,7 @@ LOADING: Final = "loading"  # the step before the first check
 ENGINE: Final = Path(__file__).parents[2]  # whose own lines are not the place of a defect
 OUTPUTS: Final = (1, 2)  # descriptors of standard output and error
 
-AnyEntry: TypeAlias = ControllerEntry | PlantEntry
-Choose: TypeAlias = Callable[[str], str]
+Word: TypeAlias = Literal["controller", "plant"]
 Checks: TypeAlias = Callable[..., Any]
 
 
@@ -71,38 +60,154 @@ class Tried:
     fault: str = ""
 
 
+@dataclass
+class Outcome:
+    """The outcome of code of a user in a sandbox.
+
+    Attributes:
+        answer: of the function; None where it gave none.
+        refusal: its `ConfigurationError`, in one line.
+        failure: why it did not return, in one line.
+    """
+
+    answer: Any = None
+    refusal: str = ""
+    failure: str = ""
+
+
 class _Trains(BaseException):
     """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
 
 
-def choose_plants(words: Sequence[str]) -> list[str]:
-    """Return the names of plants that a user names, or whose places are given, such as ./cell.py:Cell.
+def attempt(
+    function: Callable[..., Any],
+    *arguments: object,
+    limit: float,
+    why: Callable[[Ending], str],
+    hear: Tell = lambda _: None,
+    quiet: bool = True,
+) -> Outcome:
+    """Call a function with code of users in a sandbox.
+
+    Args:
+        function: takes `tell` and the arguments, and returns JSON values.
+        arguments: can be pickled.
+        limit: [s] from one message to the next.
+        why: says why the function did not return, from the end of its process.
+        hear: receives the values that the function passes to `tell`.
+        quiet: discard the output; where it is wanted, the code is called a second time.
+    """
+    outcome = Outcome()
+
+    def receive(message: object) -> None:
+        match message:
+            case ["told", told]:
+                hear(told)
+            case ["answer" | "refusal" | "failure" as field, value]:
+                setattr(outcome, field, value if field == "answer" else str(value))
+
+    end = call(_attempt_here, (function, arguments, quiet), Bounds(limit).limits(1, foreign=True), receive)
+    if end is not None:
+        outcome.failure = why(end)
+    return outcome
+
+
+def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool], tell: Tell) -> None:
+    """Call a function in this process."""
+    function, arguments, quiet = argument
+    if quiet:
+        _print_nowhere()
+    tell(None)  # its time begins
+    try:
+        tell(["answer", function(lambda told: tell(["told", told]), *arguments)])
+    except ConfigurationError as error:
+        tell(["refusal", str(error)])
+    except BaseException as error:  # noqa: BLE001 - code of users may raise anything
+        tell(["failure", Ending.of(error).reason])
+
+
+def choose(word: Word, given: str) -> str:
+    """Return the name of a controller or plant; code of users that it names is imported in a sandbox first.
+
+    Args:
+        word: the kind.
+        given: its name or place, such as ./mine.py:Mine.
 
     Raises:
-        ConfigurationError: there is no such plant, or it cannot be used; one line with file and line number.
+        ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
-    known = {*plant_names(), *(word for word in words if word.startswith(MAPPED))}
-    return [_choose(choose_plant, PlantEntry, word, word in known) for word in words]
+    registry = REGISTRIES[word]
+    folder = _folder(registry, given)
+    if folder is not None:
+        limit = IMPORT_LIMIT
+        found = attempt(_choose, word, given, limit=limit, why=_explainer(folder, limit))
+        if found.refusal or found.failure:
+            raise ConfigurationError(found.refusal or f"{given} cannot be imported: {found.failure}")
+    return registry.choose(given)
 
 
-def choose_controllers(words: Sequence[str]) -> list[str]:
-    """Return the names of controllers that a user names, or whose places are given, such as ./mine.py:Mine.
+def _choose(_tell: Tell, word: Word, given: str) -> str:
+    return REGISTRIES[word].choose(given)
+
+
+def _folder(registry: Registry[Any], given: str) -> Path | None:
+    """Return the folder of the code that a text names; None for a name of this package, and for an unknown one.
 
     Raises:
-        ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
+        ConfigurationError: a path in a home folder that is not known.
     """
-    known = controller_names()
-    return [_choose(choose_controller, ControllerEntry, word, word in known) for word in words]
+    point = registry.published(given)
+    if point is not None:
+        return folder_of_module(point.module)
+    found = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
+    if found is None:
+        return None
+    try:
+        return user_path(found["file"]).resolve().parent if found["file"] else folder_of_module(found["module"])
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
 
 
-def try_controllers(robot: str = DEFAULT_ROBOT) -> list[Tried]:
-    """Return all controllers; those of third parties are built once for a robot and thrown away."""
-    return _try_all(_Kind("controller", ControllerEntry, find_controller, _build_controller), controller_names(), robot)
+def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
+    """Return all controllers or plants, with missing packages.
+
+    Those of third parties are built once for a robot and thrown away, each in a sandbox.
+    """
+    registry = REGISTRIES[word]
+    points = {name: point for name in registry.names() if (point := registry.published(name)) is not None}
+    if points:
+        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
+    return [_try(word, points[name], robot) if name in points else _try_here(word, name) for name in registry.names()]
 
 
-def try_plants(robot: str = DEFAULT_ROBOT) -> list[Tried]:
-    """Return all plants, with their missing packages; those of third parties are built once and thrown away."""
-    return _try_all(_Kind("plant", PlantEntry, installed_plant, _build_plant), plant_names(), robot)
+def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
+    """Try one in a sandbox."""
+    why = _explainer(folder_of_module(point.module), TRIAL_LIMIT)
+    found = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT, why=why)
+    match found.answer:
+        case [str(summary), str(fault)]:
+            return Tried(point.name, summary, fault)
+    failure = found.failure or "it gave no answer"
+    return Tried(point.name, fault=f"{word} {point.name!r} ({point.value}) cannot be used: {failure}")
+
+
+def _try_there(_tell: Tell, word: Word, name: str, robot: str) -> tuple[str, str]:
+    tried = _try_here(word, name, robot)
+    return tried.summary, tried.fault
+
+
+def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
+    """Return the result of a trial; it is built for a robot if there is one."""
+    try:
+        entry = find_controller(name) if word == "controller" else installed_plant(name)
+        if robot is not None and name not in task_names():
+            with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
+                (_build_controller if word == "controller" else _build_plant)(name, robot)
+    except ConfigurationError as error:
+        return Tried(name, fault=str(error))
+    if name in task_names():
+        return Tried(name, fault=f"a task is called {name!r}, too; give the {word} another name")
+    return Tried(name, str(entry.summary))
 
 
 def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Finding], None]) -> None:
@@ -117,22 +222,24 @@ def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Findi
     Raises:
         ConfigurationError: the subject cannot be loaded.
     """
-    current, refusals = [LOADING], list[str]()
+    current = [LOADING]
 
-    def receive(item: object) -> None:
-        match item:
-            case ["found", [str(check), "ok" | "failed" | "note" as verdict, str(text)]]:
+    def receive(told: object) -> None:
+        match told:
+            case [str(check), "ok" | "failed" | "note" as verdict, str(text)]:
                 hear(Finding(check, verdict, text))
-            case ["begin", str(check)]:
+            case str(check):
                 current.append(check)
-            case ["refused", str(text)]:
-                refusals.append(text)
 
-    end = call(_check, (checks, subject), Bounds(limit).limits(1, foreign=True), receive)
-    if refusals:
-        raise ConfigurationError(refusals[0])
-    if end is not None:
-        hear(Finding(current[-1], "failed", explain(end, _is_users, limit)))
+    found = attempt(_check, checks, subject, limit=limit, why=lambda end: explain(end, _is_users, limit), hear=receive)
+    if found.refusal:
+        raise ConfigurationError(found.refusal)
+    if found.failure:
+        hear(Finding(current[-1], "failed", found.failure))
+
+
+def _check(tell: Tell, checks: Checks, subject: str) -> None:
+    checks(subject, tell, lambda finding: tell(list(finding)))
 
 
 def validate(path: Path) -> Validation:
@@ -143,15 +250,27 @@ def validate(path: Path) -> Validation:
     """
     from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
 
-    answers: list[Any] = []
-    end = call(_validate, path, Bounds().limits(1, foreign=True), answers.append)
-    match answers:
-        case [str(refusal), *_]:
-            raise ConfigurationError(refusal)
-        case [[list(problems), float() | None as deviation], *_]:
+    found = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end: end.reason, quiet=False)
+    if found.refusal:
+        raise ConfigurationError(found.refusal)
+    match found.answer:
+        case [list(problems), float() | None as deviation]:
             return Validation(tuple(map(str, problems)), deviation)
-    reason = "it gave no answer" if end is None else end.reason
-    return Validation((f"the reference run ended: {reason}",), None)
+    return Validation((f"the reference run ended: {found.failure or 'it gave no answer'}",), None)
+
+
+def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:
+    from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
+
+    try:
+        found = validate_fmu(path)
+    except (ValueError, FmuError) as error:
+        raise ConfigurationError(str(error)) from error
+    return found.problems, found.deviation
+
+
+def _explainer(folder: Path, limit: float) -> Callable[[Ending], str]:
+    return lambda end: explain(end, lambda path: is_below(path, folder), limit)
 
 
 def explain(end: Ending, is_users: Callable[[Path], bool], limit: float) -> str:
@@ -171,129 +290,6 @@ def explain(end: Ending, is_users: Callable[[Path], bool], limit: float) -> str:
     if how.startswith("exit code"):
         return f"{place}it ended the process with {how}; raise an error instead, so that the other runs go on"
     return place + end.reason.replace("the run", "it", 1)
-
-
-def _choose(choose: Choose, entry: type[AnyEntry], word: str, known: bool) -> str:
-    """Choose a controller or plant by its name or place; code of users is imported in a sandbox first."""
-    folder = _folder(entry, word, known)
-    if folder is None:
-        return choose(word)
-    refusals: list[Any] = []
-    end = call(_import, (choose, word), Bounds(IMPORT_LIMIT).limits(1, foreign=True), refusals.append)
-    if refusals:
-        raise ConfigurationError(str(refusals[0]))
-    if end is not None:
-        why = explain(end, lambda path: is_below(path, folder), IMPORT_LIMIT)
-        raise ConfigurationError(f"{word} cannot be imported: {why}")
-    return choose(word)
-
-
-def _folder(entry: type[AnyEntry], word: str, known: bool) -> Path | None:
-    """Return the folder of the code that a word names; None for a name of this package, and for an unknown one.
-
-    Raises:
-        ConfigurationError: a path in a home folder that is not known.
-    """
-    point = published(entry, word)
-    if point is not None:
-        return folder_of_module(point.module)
-    found = None if known else PLACE.fullmatch(word)
-    if found is None:
-        return None
-    try:
-        return user_path(found["file"]).resolve().parent if found["file"] else folder_of_module(found["module"])
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
-
-
-@dataclass(frozen=True)
-class _Kind:
-    word: str
-    entry: type[AnyEntry]
-    find: Callable[[str], AnyEntry]
-    build: Callable[[str, str], None]  # takes the names of a controller or plant and of a robot
-
-    def try_one(self, name: str, robot: str | None = None) -> Tried:
-        """Return the result of a trial; it is built for a robot if there is one."""
-        try:
-            entry = self.find(name)
-            if robot is not None and name not in task_names():
-                with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
-                    self.build(name, robot)
-        except ConfigurationError as error:
-            return Tried(name, fault=str(error))
-        if name in task_names():
-            return Tried(name, fault=f"a task is called {name!r}, too; give the {self.word} another name")
-        return Tried(name, str(entry.summary))
-
-
-def _try_all(kind: _Kind, names: Sequence[str], robot: str) -> list[Tried]:
-    """Try each one that third parties publish in a sandbox, and look the others up here."""
-    points = {name: point for name in names if (point := published(kind.entry, name)) is not None}
-    if points:
-        import servobench.plant.kinematic  # noqa: F401, PLC0415 - once, and not in each sandbox
-    return [_try(kind, points[name], robot) if name in points else kind.try_one(name) for name in names]
-
-
-def _try(kind: _Kind, point: EntryPoint, robot: str) -> Tried:
-    """Try one in a sandbox."""
-    answers: list[Any] = []
-    end = call(_try_here, (kind, point.name, robot), Bounds(TRIAL_LIMIT).limits(1, foreign=True), answers.append)
-    match answers:
-        case [[str(summary), str(fault)], *_]:
-            return Tried(point.name, summary, fault)
-    folder = folder_of_module(point.module)
-    why = "it gave no answer" if end is None else explain(end, lambda path: is_below(path, folder), TRIAL_LIMIT)
-    return Tried(point.name, fault=f"{kind.word} {point.name!r} ({point.value}) cannot be used: {why}")
-
-
-def _try_here(argument: tuple[_Kind, str, str], tell: Tell) -> None:
-    """Try one in this process."""
-    kind, name, robot = argument
-    _print_nowhere()
-    tell(None)  # its time begins
-    try:
-        tried = kind.try_one(name, robot)
-    except BaseException as error:  # noqa: BLE001 - code of users may raise anything
-        tried = Tried(name, fault=f"{kind.word} {name}: {Ending.of(error).reason}")
-    tell([tried.summary, tried.fault])
-
-
-def _import(argument: tuple[Choose, str], tell: Tell) -> None:
-    """Choose a controller or plant in this process."""
-    choose, word = argument
-    _print_nowhere()
-    tell(None)
-    try:
-        choose(word)
-    except ConfigurationError as error:
-        tell(str(error))
-    except BaseException as error:  # noqa: BLE001 - code of users may raise anything
-        tell(f"{word} cannot be imported: {Ending.of(error).reason}")
-
-
-def _check(argument: tuple[Checks, str], tell: Tell) -> None:
-    """Carry checks out in this process."""
-    checks, subject = argument
-    _print_nowhere()
-    tell(["begin", LOADING])
-    try:
-        checks(subject, lambda name: tell(["begin", name]), lambda finding: tell(["found", list(finding)]))
-    except ConfigurationError as error:
-        tell(["refused", str(error)])
-
-
-def _validate(path: Path, tell: Tell) -> None:
-    """Check an FMU in this process."""
-    from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
-
-    tell(None)
-    try:
-        found = validate_fmu(path)
-    except (ValueError, FmuError) as error:
-        tell(str(error))
-    else:
-        tell([found.problems, found.deviation])
 
 
 def _build_controller(name: str, robot: str) -> None:

@@ -14,10 +14,9 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, at, attributes, differing, watching_draws
-from servobench.harness.config.adapters import Build, folder_of
+from servobench.harness.config.adapters import folder_of
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.entries import CONTROLLER, own_object
-from servobench.harness.config.registry import choose_controller, find_controller, offer, offering
+from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.plant.contract.faults import ConfigurationError
 
 JOINTS, FEATURES = 6, 3
@@ -52,9 +51,7 @@ def check_controller(
         ConfigurationError: the controller cannot be loaded; it is a ValueError.
     """
     with offering():
-        name = (
-            choose_controller(controller) if isinstance(controller, str) else offer(own_object(CONTROLLER, controller))
-        )
+        name = choose_controller(controller)
         findings = []
         for finding in ControllerChecks(find_controller(name)).carry_out(begin):
             findings.append(finding)
@@ -73,7 +70,7 @@ class ControllerChecks:
             rig: makes an arm of n joints and m features.
         """
         self.entry, self.rig, self.steps = entry, rig, STEPS
-        self.folder = folder_of(entry.build.make if isinstance(entry.build, Build) else entry.build)
+        self.folder = folder_of(entry.build)
         self._times: list[float] = []
         self._printed = ""
 

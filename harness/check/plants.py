@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.config.adapters import Build, folder_of
-from servobench.harness.config.entries import PLANT, own_object
+from servobench.harness.config.adapters import folder_of
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.signals import Command, Observation
@@ -48,7 +47,7 @@ def check_plant(
         ConfigurationError: there is no such plant, or it cannot be loaded; it is a ValueError.
     """
     with offering():
-        entry = find_plant(choose_plant(plant)) if isinstance(plant, str) else own_object(PLANT, plant).entry
+        entry = find_plant(choose_plant(plant))
         findings = []
         for finding in PlantChecks(entry).carry_out(begin):
             findings.append(finding)
@@ -66,8 +65,7 @@ class PlantChecks:
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
         """Yield the finding of each check; the plant is closed at the end."""
         try:
-            build = self.entry.build
-            yield from findings_of(self.checks(), folder_of(build.make if isinstance(build, Build) else build), begin)
+            yield from findings_of(self.checks(), folder_of(self.entry.build), begin)
         finally:
             for plant in self._plant:
                 with contextlib.suppress(Exception):  # the check of `close` has reported it

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,7 +15,7 @@ from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.trials import Tried
+    from servobench.harness.batch.trials import Word
 
 DEFAULT_ROBOT = "ur5"
 STANDARD_OUTPUT = Path("-")
@@ -23,44 +23,42 @@ HELP = "Name whose settings to show."
 
 
 def plants(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_plants)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.PLANT.complete)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.batch.trials import choose_plants, try_plants
-    from servobench.harness.config.registry import find_plant, unused_points
-    from servobench.plant.bench.plant import PlantEntry
+    from servobench.harness.batch.trials import choose
+    from servobench.harness.config.registry import find_plant
 
     if name:
-        (name,) = choose_plants([name])
+        name = choose("plant", name)
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
-        _show_names(_listed(try_plants(), unused_points(PlantEntry)), as_json=as_json)
+        _show_names(_listed("plant"), as_json=as_json)
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_controllers)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.CONTROLLER.complete)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
-    from servobench.controllers.controller import ControllerEntry
     from servobench.controllers.parts import ESTIMATORS, LAWS
-    from servobench.harness.batch.trials import choose_controllers, try_controllers
+    from servobench.harness.batch.trials import choose
     from servobench.harness.config.defaults import default_config
-    from servobench.harness.config.registry import find_controller, unused_points
+    from servobench.harness.config.registry import find_controller
 
     if name:
-        (name,) = choose_controllers([name])
+        name = choose("controller", name)
         _show_settings(name, default_config(find_controller(name)), as_json=as_json)
         return
-    _show_names(_listed(try_controllers(), unused_points(ControllerEntry)), as_json=as_json)
+    _show_names(_listed("controller"), as_json=as_json)
     if not as_json:
         console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
         console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)] = None,
     robot: Annotated[
         str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
     ] = DEFAULT_ROBOT,
@@ -108,7 +106,8 @@ def init(
     from servobench.harness.run.resolution import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
 
-    names = selection.split_plants(plants), selection.split_controllers(controllers), selection.split_tasks(tasks)
+    split = selection.split
+    names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
     nominal = read_mismatch("none")
     requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
@@ -137,13 +136,16 @@ def _described(name: str, summary: str) -> dict[str, str]:
     return {"name": name, "summary": summary}
 
 
-def _listed(all_of_them: Iterable[Tried], unused: Iterable[tuple[str, str]]) -> list[dict[str, str]]:
-    """Return names with their summaries, or with the fault of those that cannot be used."""
+def _listed(word: Word) -> list[dict[str, str]]:
+    """Return the names of a kind with their summaries, or with the fault of those that cannot be used."""
+    from servobench.harness.batch.trials import try_all
+    from servobench.harness.config.registry import REGISTRIES
+
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
-        for each in all_of_them
+        for each in try_all(word)
     ]
-    return found + [{"name": name, "error": line} for name, line in unused]
+    return found + [{"name": name, "error": line} for name, line in REGISTRIES[word].unused_points()]
 
 
 def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:

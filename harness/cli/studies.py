@@ -92,9 +92,9 @@ def robustness(
     from servobench.harness.studies.robustness import find_lines, make_map
 
     settings = overrides.settings()
-    lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
-    names = selection.split_controllers(controllers, robot)
-    where = selection.split_plants(plant, "plant", robot)[0]
+    lines = find_lines(selection.split_words(axes))
+    names = selection.split("controllers", controllers, robot=robot)
+    where = selection.split("plants", plant, option="plant", robot=robot)[0]
     with watching(console, out) as observer:
         how = running.execution(observer)
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
@@ -133,7 +133,7 @@ def claims(
         reproduce,
     )
 
-    names = selection.split_plants(plants)
+    names = selection.split("plants", plants)
     divisions = find_divisions(division)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
@@ -194,7 +194,7 @@ def tune(
 
     names = selection.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     try:
-        runs = TuningSet(selection.split_plants(plants), robots, offset)
+        runs = TuningSet(selection.split("plants", plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
         refuse(str(error))

@@ -11,14 +11,16 @@ from __future__ import annotations
 import hashlib
 import inspect
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Generic, TypeVar, get_type_hints
+from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar, get_type_hints
 
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.harness.config.adapters import BenchSettings, Build, Copy, Guarded, NoSettings, OnBench, folder_of
+from servobench.harness.config.adapters import BenchSettings, Guarded, NoSettings, copy_of, folder_of, on_bench
 from servobench.harness.config.source import PLACE, SourceFile, describe_at, digest_of_module, import_user_module, show
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.contract.faults import ConfigurationError
@@ -26,109 +28,132 @@ from servobench.plant.contract.settings import suggest
 
 NAME: Final = re.compile(r"\w+(?:[:-]\w+)*")
 
-Entry = TypeVar("Entry", ControllerEntry, PlantEntry)
+
+class Named(Protocol):
+    """An entry: a frozen dataclass with a name."""
+
+    @property
+    def name(self) -> str:
+        """The word by which users name it."""
 
 
-@dataclass(frozen=True)
-class Kind(Generic[Entry]):
-    """A kind of object that users may give: controllers, or plants.
-
-    Attributes:
-        word: for messages.
-        entry: its class of entries.
-        bases: classes below which it may be given.
-        argument: argument of a constructor beside the settings.
-        wanted: the accepted objects, in words.
-        of_class: makes an entry of a class and that of its settings, None if it takes none.
-        make: makes an entry of a given object, its place and a name or None; None for `make_entry`.
-    """
-
-    word: str
-    entry: type[Entry]
-    bases: tuple[type, ...]
-    argument: str
-    wanted: str
-    of_class: Callable[[type[Any], type[Any] | None], Entry]
-    make: Callable[[object, str, str | None], Entry] | None = None
+Entry = TypeVar("Entry", bound=Named)
 
 
-def _controller_of(kind: type[Any], config: type[Any] | None) -> ControllerEntry:
-    build = Build(kind, with_config=config is not None)
-    return ControllerEntry(kind.__name__, _summary(kind), config or NoSettings, build)
+class Kind(ABC, Generic[Entry]):
+    """A kind of object that users may give: controllers, plants, or tasks."""
 
+    word: ClassVar[str]
+    """for messages"""
+    entry: ClassVar[type[Any]]
+    """its class of entries"""
+    bases: ClassVar[tuple[type, ...]]
+    """classes below which it may be given"""
+    wanted: ClassVar[str]
+    """the accepted objects, in words"""
 
-def _plant_of(kind: type[Any], config: type[Any] | None) -> PlantEntry:
-    if issubclass(kind, World):
-        default: type[Any] = BenchSettings
-        build = Build(OnBench(kind, config is not None), Plant)
-    else:
-        default, build = NoSettings, Build(kind, Plant, with_config=config is not None)
-    return PlantEntry(kind.__name__, _summary(kind), config or default, build, own_robot=bool(kind.own_robot))
+    @abstractmethod
+    def of_class(self, given: type[Any]) -> Entry:
+        """Return the entry of a class."""
 
+    @abstractmethod
+    def checked(self, entry: Entry, place: str) -> Entry:
+        """Return an entry that was checked, with a guard around the functions of a user.
 
-CONTROLLER: Final = Kind(
-    "controller",
-    ControllerEntry,
-    (Controller,),
-    "knowledge",
-    "wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
-    _controller_of,
-)
-PLANT: Final = Kind(
-    "plant",
-    PlantEntry,
-    (Plant, World),
-    "setup",
-    "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry",
-    _plant_of,
-)
+        Raises:
+            ConfigurationError: it cannot be used; says the remedy.
+        """
 
+    def of_object(self, given: Any, place: str) -> Entry:  # noqa: ANN401 - of one of `bases`
+        """Return the entry of an object that is built already.
 
-def make_entry(kind: Kind[Entry], given: object, place: str, name: str | None = None) -> Entry:
-    """Return the entry of a class, an object or an entry, checked as far as it can be without a robot.
-
-    Args:
-        kind: `CONTROLLER` or `PLANT`.
-        given: by the user.
-        place: where it stands, for messages.
-        name: its name; None for the name of the entry or of the class.
-
-    Raises:
-        ConfigurationError: it cannot be used; says the remedy.
-    """
-    if isinstance(given, kind.entry):
-        if isinstance(given.build, type) and issubclass(given.build, kind.bases):
-            check_class(given.build)
-        entry = _guard(given)
-    elif isinstance(given, type) and issubclass(given, kind.bases):
-        check_class(given)
-        entry = kind.of_class(given, _config_class(given, kind.argument))
-    elif isinstance(given, Controller) and kind.entry is ControllerEntry:
-        own = type(given)
-        build = Build(Copy(given), with_config=False)
-        entry = kind.entry(own.__name__, _summary(own), NoSettings, build)
-    elif isinstance(given, kind.bases):
+        Raises:
+            ConfigurationError: there is none.
+        """
+        del given
         raise ConfigurationError(
-            f"{place} is a {kind.word} that is built already; give its class, as each run needs one"
+            f"{place} is a {self.word} that is built already; give its class, as each run needs one"
         )
-    else:
-        raise ConfigurationError(f"{place} is {_describe(given)}, {kind.wanted}")
-    entry = replace(entry, name=name or entry.name)
-    _check_entry(entry, place)
-    return entry
+
+    def make_entry(self, given: object, place: str, name: str | None = None) -> Entry:
+        """Return the entry of a class, an object or an entry, checked as far as it can be without a robot.
+
+        Args:
+            given: by the user.
+            place: where it stands, for messages.
+            name: its name; None for the name of the entry or of the class.
+
+        Raises:
+            ConfigurationError: it cannot be used; says the remedy.
+        """
+        if isinstance(given, self.entry):
+            entry: Any = given
+            if isinstance(build := getattr(given, "build", None), type):
+                check_class(build)
+        elif isinstance(given, type) and issubclass(given, self.bases):
+            check_class(given)
+            entry = self.of_class(given)
+        elif isinstance(given, self.bases):
+            entry = self.of_object(given, place)
+        else:
+            raise ConfigurationError(f"{place} is {_describe(given)}, {self.wanted}")
+        named: Entry = replace(entry, name=name or entry.name)
+        if not (isinstance(named.name, str) and NAME.fullmatch(named.name)):
+            raise ConfigurationError(f"{place}: the name must be letters, digits and _, got {named.name!r}")
+        return self.checked(named, place)
 
 
-def _guard(entry: Entry) -> Entry:
-    """Return an entry whose functions, which are a user's, tell their errors as one line."""
-    if isinstance(entry.build, Build):
-        return entry
-    if isinstance(entry, ControllerEntry):
-        return replace(entry, build=Build(entry.build))
-    code: Any = entry.build
-    is_world = isinstance(code, type) and issubclass(code, World)
-    build = Build(OnBench(code, with_config=True) if is_world else code, Plant)
-    engine, config_for = (None if code is None else Guarded(code) for code in (entry.engine, entry.config_for))
-    return replace(entry, build=build, engine=engine, config_for=config_for)
+class _ControllerKind(Kind[ControllerEntry]):
+    word, entry, bases = "controller", ControllerEntry, (Controller,)
+    wanted = "wanted a subclass of servobench.Controller or a servobench.ControllerEntry"
+
+    def of_class(self, given: type[Any]) -> ControllerEntry:
+        config = _config_class(given, "knowledge")
+        build = Guarded(given, Controller, with_config=config is not None)
+        return ControllerEntry(given.__name__, summary_of(given), config or NoSettings, build)
+
+    def of_object(self, given: Controller, place: str) -> ControllerEntry:
+        del place
+        own = type(given)
+        build = Guarded(partial(copy_of, given), Controller, with_config=False)
+        return ControllerEntry(own.__name__, summary_of(own), NoSettings, build)
+
+    def checked(self, entry: ControllerEntry, place: str) -> ControllerEntry:
+        check_settings(entry.config, place)
+        return replace(entry, build=_guarded(entry.build, Controller))
+
+
+class _PlantKind(Kind[PlantEntry]):
+    word, entry, bases = "plant", PlantEntry, (Plant, World)
+    wanted = "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry"
+
+    def of_class(self, given: type[Any]) -> PlantEntry:
+        config = _config_class(given, "setup")
+        default: type[Any] = NoSettings
+        build = Guarded(given, Plant, with_config=config is not None)
+        if issubclass(given, World):
+            build, default = Guarded(partial(on_bench, given, config is not None), Plant), BenchSettings
+        own_robot = bool(given.own_robot)
+        return PlantEntry(given.__name__, summary_of(given), config or default, build, own_robot=own_robot)
+
+    def checked(self, entry: PlantEntry, place: str) -> PlantEntry:
+        check_settings(entry.config, place)
+        needs: object = entry.needs
+        if not isinstance(needs, tuple):
+            raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
+        code: Any = entry.build
+        if isinstance(code, type) and issubclass(code, World):
+            code = partial(on_bench, code, True)
+        engine, config_for = (None if each is None else Guarded(each) for each in (entry.engine, entry.config_for))
+        return replace(entry, build=_guarded(code, Plant), engine=engine, config_for=config_for)
+
+
+CONTROLLER: Final = _ControllerKind()
+PLANT: Final = _PlantKind()
+
+
+def _guarded(build: Callable[..., Any], kind: type[Controller] | type[Plant]) -> Guarded:
+    return build if isinstance(build, Guarded) else Guarded(build, kind)
 
 
 def check_class(kind: type[Any]) -> None:
@@ -143,23 +168,14 @@ def check_class(kind: type[Any]) -> None:
         raise ConfigurationError(f"{_class_place(kind)}: class {kind.__name__} lacks {lacking}, which it must define")
 
 
-def _check_entry(entry: ControllerEntry | PlantEntry, place: str) -> None:
-    if not (isinstance(entry.name, str) and NAME.fullmatch(entry.name)):
-        raise ConfigurationError(f"{place}: the name must be letters, digits and _, got {entry.name!r}")
-    if not callable(entry.config):
-        raise ConfigurationError(f"{place}: config must be a dataclass or a function, got {entry.config!r}")
-    check_settings(entry.config, place)
-    needs: object = entry.needs if isinstance(entry, PlantEntry) else ()
-    if not isinstance(needs, tuple):
-        raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
-
-
 def check_settings(config: Callable[[], Any], place: str) -> None:
     """Refuse settings that cannot be made without arguments, or that are no dataclass.
 
     Raises:
         ConfigurationError: says the remedy.
     """
+    if not callable(config):
+        raise ConfigurationError(f"{place}: config must be a dataclass or a function, got {config!r}")
     where, name = (_class_place(config), config.__name__) if isinstance(config, type) else (place, "config")
     needed = _without_default(config)
     if needed:
@@ -209,7 +225,8 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
     return config
 
 
-def _summary(kind: type[Any]) -> str:
+def summary_of(kind: type[Any]) -> str:
+    """Return the first line of the docstring of a class, or its name."""
     lines = (kind.__doc__ or "").strip().splitlines()
     return lines[0] if lines else kind.__name__
 
@@ -279,11 +296,7 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
         source, module = None, import_user_module(found["module"])
         given = _pick(kind, module, found["module"], found["attribute"])
         file, digest = Path(module.__file__ or found["module"]), digest_of_module(found["module"])
-    if kind.make is None:
-        entry = make_entry(kind, given, place, found["alias"])
-    else:
-        entry = kind.make(given, place, found["alias"])
-    return Own(kind.word, entry, place, source, str(file), digest)
+    return Own(kind.word, kind.make_entry(given, place, found["alias"]), place, source, str(file), digest)
 
 
 def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
@@ -294,7 +307,7 @@ def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
     """
     code = given.build if isinstance(given, kind.entry) else given
     built = code if isinstance(code, type) else type(code)
-    entry = make_entry(kind, given, kind.word)
+    entry = kind.make_entry(given, kind.word)
     try:
         file, text = inspect.getfile(built), inspect.getsource(built)
     except (OSError, TypeError):  # typed into an interpreter

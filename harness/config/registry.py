@@ -8,24 +8,17 @@ that a user gives as files or objects are offered under a name for as long as a 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.config.entries import (
-    CONTROLLER,
-    PLANT,
-    Entry,
-    Kind,
-    Own,
-    make_entry,
-    read_own,
-)
+from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, Own, own_object, read_own
 from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.source import describe_import, is_place
 from servobench.plant.bench.plant import PlantEntry
@@ -35,9 +28,6 @@ from servobench.plant.contract.settings import suggest
 
 if TYPE_CHECKING:
     from servobench.plant.rendered.engine import OpenScene
-
-PLANT_GROUP = "servobench.plants"
-CONTROLLER_GROUP = "servobench.controllers"
 
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
@@ -54,7 +44,7 @@ NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
 
 
-Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry] | Own[Any]
+Offer: TypeAlias = Own[Any]
 
 _OFFERED: dict[str, Offer] = {}
 
@@ -71,108 +61,183 @@ def offering(given: Iterable[Offer] = ()) -> Iterator[None]:
         _OFFERED.update(before)
 
 
-def offer(own: Offer) -> str:
-    """Let a controller or plant of a user be found by its name, and return this name.
-
-    Settings stand in sections of these names, so a controller and a plant cannot share one.
-
-    Raises:
-        ConfigurationError: another controller or plant has this name.
-    """
-    name, other = own.name, _OFFERED.get(own.name)
-    taken = {RUN: "a section of settings", **dict.fromkeys(plant_names(), "a plant")}
-    taken |= dict.fromkeys(controller_names(), "a controller")
-    if name in taken:
-        raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
-    if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
-        raise ConfigurationError(f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}")
-    _OFFERED[name] = own
-    return name
-
-
 def offered(names: Iterable[str]) -> tuple[Offer, ...]:
     """Return those of the controllers and plants `names` that users gave."""
     return tuple(_OFFERED[name] for name in names if name in _OFFERED)
 
 
-def choose_controller(text: str) -> str:
-    """Return the name of the controller that a user names, or whose place is given: ./mine.py:Mine, ./mine.fmu.
+@dataclass(frozen=True, eq=False)
+class Registry(Generic[Entry]):
+    """Entries of a kind by name: of this package, given by the user, or published by other distributions.
 
-    An FMU, or a mapping of its names (TOML), is called `fmu:PATH`.
-
-    Raises:
-        ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
+    Attributes:
+        kind: of the entries.
+        group: of the entry points by which others publish them.
+        own: those of this package, or their place `MODULE:NAME` where that loads slowly.
+        made: makes the entry of a name with a meaning of its own; None for other names.
+        advice: about an unknown name; empty for the nearest name.
+        suffixes: of files whose name is `fmu:PATH`.
     """
-    if text.endswith((".fmu", ".toml")) and not text.startswith(MAPPED):
-        text = f"{MAPPED}{text}"
-    if text not in (*_OFFERED, *controller_names()) and not text.startswith(MAPPED) and is_place(text):
-        return offer(read_own(CONTROLLER, text))
-    find_controller(text)
-    return text
 
+    kind: Kind[Entry]
+    group: str
+    own: Mapping[str, Entry | str]
+    made: Callable[[str], Entry | None] = lambda _: None
+    advice: Callable[[str], str] = lambda _: ""
+    suffixes: tuple[str, ...] = ()
 
-def choose_plant(text: str) -> str:
-    """Return the name of the plant that a user names, or whose place is given, such as ./cell.py:Cell.
+    def names(self) -> list[str]:
+        """Return all names, those of this package first."""
+        return list(dict.fromkeys([*self.own, *_points(self.group)]))
 
-    Raises:
-        ConfigurationError: there is no such plant, or it cannot be used; one line with file and line number.
-    """
-    if not (text in (*_OFFERED, *plant_names()) or text.startswith(MAPPED)) and is_place(text):
-        return offer(read_own(PLANT, text))
-    find_plant(text)
-    return text
+    def find(self, name: str) -> Entry:
+        """Return the entry of a name.
 
-
-def plant_names() -> list[str]:
-    """Return the names of all plants, those of this package first."""
-    return list(_points(PLANT_GROUP))
-
-
-def controller_names() -> list[str]:
-    """Return the names of all controllers, those of this package first."""
-    return list(dict.fromkeys([*METHODS, *_points(CONTROLLER_GROUP)]))
-
-
-def find_plant(name: str) -> PlantEntry:
-    """Return the plant called `name`, or for a name like `fmu:PATH.toml` the FMU that this mapping describes.
-
-    Raises:
-        ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
-    """
-    if name.startswith(MAPPED):
-        from servobench.plant.fmu.world import fmu_entry  # noqa: PLC0415 - loads CasADi
-
+        Raises:
+            ConfigurationError: no such name, or an entry that cannot be made or loaded.
+        """
         try:
-            return fmu_entry(user_path(name.removeprefix(MAPPED)))
+            made = self.made(name)
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
-    own = _OFFERED.get(name)
-    return own.entry if own is not None and isinstance(own.entry, PlantEntry) else _load_plant(name)
+        if made is not None:
+            return made
+        given = _OFFERED.get(name)
+        if given is not None and given.word == self.kind.word:
+            entry: Entry = given.entry
+            return entry
+        loaded: Entry = _load(self, name)
+        return loaded
+
+    def choose(self, given: object) -> str:
+        """Return the name of an entry by which it is found from now on.
+
+        Args:
+            given: a name, the place of a user's code such as ./mine.py:Mine, or what a user gave in Python.
+
+        Raises:
+            ConfigurationError: there is none, or it cannot be used; one line with file and line number.
+        """
+        if not isinstance(given, str):
+            return self.offer(own_object(self.kind, given))
+        if given.endswith(self.suffixes) and not given.startswith(MAPPED):
+            given = f"{MAPPED}{given}"
+        if given not in (*_OFFERED, *self.names()) and not given.startswith(MAPPED) and is_place(given):
+            return self.offer(read_own(self.kind, given))
+        self.find(given)
+        return given
+
+    def offer(self, own: Own[Entry]) -> str:
+        """Let an entry of a user be found by its name, and return this name.
+
+        Settings stand in sections of these names, so a controller and a plant cannot share one.
+
+        Raises:
+            ConfigurationError: another controller or plant has this name.
+        """
+        name, other = own.name, _OFFERED.get(own.name)
+        taken = {RUN: "a section of settings"}
+        for registry in (PLANT_REGISTRY, CONTROLLER_REGISTRY, self):
+            taken |= dict.fromkeys(registry.names(), f"a {registry.kind.word}")
+        if name in taken:
+            raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
+        if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
+            raise ConfigurationError(f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}")
+        _OFFERED[name] = own
+        return name
+
+    def published(self, name: str) -> EntryPoint | None:
+        """Return where another distribution has the entry of this name; None where no other has it."""
+        return None if name in self.own or name in _OFFERED else _points(self.group).get(name)
+
+    def unused_points(self) -> list[tuple[str, str]]:
+        """Return the names of entry points that are not used, each with a line that says why: others have the name."""
+        found = dict[tuple[str, str], str]()
+        for point in entry_points(group=self.group):
+            used = _points(self.group).get(point.name)
+            if point.name in self.own:
+                why = f"servobench has a {self.kind.word} of this name, which cannot be taken over"
+            elif used is None:
+                why = "the command line has another meaning for this name"
+            elif used.value != point.value:
+                why = f"another distribution publishes {used.value} under this name"
+            else:
+                continue
+            line = f"{self.kind.word} {point.name!r} ({point.value}) is not used: {why}"
+            found[point.name, point.value] = line
+        return [(name, line) for (name, _), line in found.items()]
 
 
-def published(entry: type[ControllerEntry | PlantEntry], name: str) -> EntryPoint | None:
-    """Return where another distribution has the controller or plant of this name; None where no other has it."""
-    group = PLANT_GROUP if entry is PlantEntry else CONTROLLER_GROUP
-    return None if name in {*PLANTS, *CONTROLLERS, *_OFFERED} else _points(group).get(name)
-
-
-def unused_points(entry: type[ControllerEntry | PlantEntry]) -> list[tuple[str, str]]:
-    """Return the names of entry points that are not used, each with a line that says why: others have the name."""
-    group, kind = (PLANT_GROUP, PLANT) if entry is PlantEntry else (CONTROLLER_GROUP, CONTROLLER)
-    own = PLANTS if entry is PlantEntry else CONTROLLERS
-    found = dict[tuple[str, str], str]()
+@cache
+def _points(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group that have a name of their own, the first one of each name."""
+    points: dict[str, EntryPoint] = {}
     for point in entry_points(group=group):
-        used = _points(group).get(point.name)
-        if point.name in own:
-            why = f"servobench has a {kind.word} of this name, which cannot be taken over"
-        elif point.name in (RUN, ALL):
-            why = "the command line has another meaning for this name"
-        elif used is not None and used.value != point.value:
-            why = f"another distribution publishes {used.value} under this name"
-        else:
-            continue
-        found[point.name, point.value] = f"{kind.word} {point.name!r} ({point.value}) is not used: {why}"
-    return [(name, line) for (name, _), line in found.items()]
+        if point.name not in (RUN, ALL):
+            points.setdefault(point.name, point)
+    return points
+
+
+@cache
+def _load(registry: Registry[Any], name: str) -> Any:  # noqa: ANN401 - an entry of the registry
+    own, kind = registry.own.get(name), registry.kind.word
+    if own is not None and not isinstance(own, str):
+        return own
+    point = _points(registry.group).get(name) if own is None else EntryPoint(name, own, registry.group)
+    if point is None:
+        if Path(f"{name}.py").is_file():
+            raise ConfigurationError(f"unknown {kind} {name!r}: did you mean your file './{name}.py'?")
+        raise ConfigurationError(f"unknown {kind} {name!r}: {registry.advice(name) or suggest(name, registry.names())}")
+    try:
+        given = point.load()
+    except (Exception, SystemExit) as error:
+        why = describe_import(error, point.module)
+        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error
+    if own is not None:
+        return given
+    try:
+        return registry.kind.make_entry(given, point.value, name)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be used: {error}") from error
+
+
+def _mapped_plant(name: str) -> PlantEntry | None:
+    """Return the plant of a name `fmu:PATH.toml`: the FMU that this mapping describes."""
+    if not name.startswith(MAPPED):
+        return None
+    from servobench.plant.fmu.world import fmu_entry  # noqa: PLC0415 - loads CasADi
+
+    return fmu_entry(user_path(name.removeprefix(MAPPED)))
+
+
+def _made_controller(name: str) -> ControllerEntry | None:
+    """Return the controller of a name `fmu:PATH`, or that of a pair such as `mfac+rls`."""
+    if name.startswith(MAPPED):
+        from servobench.harness.config.fmu_controller import mapped_controller  # noqa: PLC0415 - as of plants
+
+        return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
+    law, plus, estimator = name.partition("+")
+    if not plus:
+        return None
+    try:
+        return compose(law, estimator)
+    except ValueError as error:
+        raise ValueError(f"controller {name!r}: {error}") from error
+
+
+PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant)
+CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
+    CONTROLLER,
+    "servobench.controllers",
+    dict[str, ControllerEntry | str](METHODS) | NOT_COMPOSED,
+    _made_controller,
+    suggest_pair,
+    (".fmu", ".toml"),  # an FMU, or a mapping of its names
+)
+REGISTRIES: Final[Mapping[str, Registry[Any]]] = {"plant": PLANT_REGISTRY, "controller": CONTROLLER_REGISTRY}
+find_plant, choose_plant, plant_names = PLANT_REGISTRY.find, PLANT_REGISTRY.choose, PLANT_REGISTRY.names
+find_controller, choose_controller = CONTROLLER_REGISTRY.find, CONTROLLER_REGISTRY.choose
+controller_names = CONTROLLER_REGISTRY.names
 
 
 def installed_plant(name: str) -> PlantEntry:
@@ -187,34 +252,6 @@ def installed_plant(name: str) -> PlantEntry:
     if lack:
         raise ConfigurationError(f"plant {name!r} cannot run here: {lack}")
     return entry
-
-
-def find_controller(name: str) -> ControllerEntry:
-    """Return the controller called `name`, the one composed for a name like `mfac+rls`, or the FMU of `fmu:PATH`.
-
-    Raises:
-        ConfigurationError: no such controller, an FMU or mapping that cannot be used, or a third party's that cannot be
-            loaded.
-    """
-    if name.startswith(MAPPED):
-        from servobench.harness.config.fmu_controller import mapped_controller  # noqa: PLC0415 - as of plants
-
-        try:
-            return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from error
-    law, plus, estimator = name.partition("+")
-    if plus:
-        try:
-            return compose(law, estimator)
-        except ValueError as error:
-            raise ConfigurationError(f"controller {name!r}: {error}") from error
-    own = _OFFERED.get(name)
-    if own is not None and isinstance(own.entry, ControllerEntry):
-        return own.entry
-    if name in METHODS:
-        return METHODS[name]
-    return _load_controller(name)
 
 
 def is_foreign_plant(name: str, *, trusted: bool = False) -> bool:
@@ -238,57 +275,6 @@ def _rename(own: Offer) -> str:
     if own.given:
         return f"give yours another name, as a class of that name or in a {type(own.entry).__name__}"
     return f"give yours another name, such as my_{own.name.replace(':', '_')}={own.place}"
-
-
-@cache
-def _load_plant(name: str) -> PlantEntry:
-    given = _load(PLANT_GROUP, PLANT.word, name)
-    if name in PLANTS and isinstance(given, PlantEntry):
-        return given
-    return _published(PLANT_GROUP, PLANT, name, given)
-
-
-@cache
-def _load_controller(name: str) -> ControllerEntry:
-    given = _load(CONTROLLER_GROUP, CONTROLLER.word, name)
-    if name in NOT_COMPOSED and isinstance(given, ControllerEntry):
-        return given
-    return _published(CONTROLLER_GROUP, CONTROLLER, name, given)
-
-
-def _published(group: str, kind: Kind[Entry], name: str, given: object) -> Entry:
-    """Return the entry of a published controller or plant."""
-    value = _points(group)[name].value
-    try:
-        return make_entry(kind, given, value, name)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{kind.word} {name!r} ({value}) cannot be used: {error}") from error
-
-
-@cache
-def _points(group: str) -> dict[str, EntryPoint]:
-    own = PLANTS if group == PLANT_GROUP else NOT_COMPOSED
-    points = {name: EntryPoint(name, value, group) for name, value in own.items()}
-    for point in entry_points(group=group):
-        if point.name not in (RUN, ALL):
-            points.setdefault(point.name, point)
-    return points
-
-
-@cache
-def _load(group: str, kind: str, name: str) -> object:
-    points = _points(group)
-    if name not in points:
-        known, hint = (plant_names(), "") if group == PLANT_GROUP else (controller_names(), suggest_pair(name))
-        if Path(f"{name}.py").is_file():
-            raise ConfigurationError(f"unknown {kind} {name!r}: did you mean your file './{name}.py'?")
-        raise ConfigurationError(f"unknown {kind} {name!r}: {hint or suggest(name, known)}")
-    point = points[name]
-    try:
-        return point.load()
-    except (Exception, SystemExit) as error:
-        why = describe_import(error, point.module)
-        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error
 
 
 def engine_of(name: str) -> str:

@@ -12,17 +12,13 @@ group `servobench.tasks`.
 from __future__ import annotations
 
 from dataclasses import is_dataclass, replace
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
-from servobench.harness.config.entries import Kind, check_class, check_settings, read_own
-from servobench.harness.config.registry import ALL, RUN, offer, offered
+from servobench.harness.config.entries import Kind, check_settings, summary_of
+from servobench.harness.config.registry import Registry
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.source import describe_import, is_place
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
@@ -32,7 +28,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings, suggest
+from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
@@ -40,7 +36,6 @@ from servobench.plant.robot.workspace import Workspace
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
 RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] of the curves on a UR5
-GROUP: Final = "servobench.tasks"  # of entry points, by which other distributions publish tasks
 STRETCHED_START: Final = "singular_start"
 
 
@@ -282,93 +277,24 @@ _ENTRIES = (
 TASKS = {entry.name: entry for entry in _ENTRIES}
 
 
-def task_names() -> list[str]:
-    """Return the names of all tasks, those of this package first."""
-    return [*TASKS, *_published()]
+class _TaskKind(Kind[TaskEntry]):
+    word, entry, bases = "task", TaskEntry, (Task,)
+    wanted = "wanted a dataclass below servobench.Task or a servobench.TaskEntry"
+
+    def of_class(self, given: type[Any]) -> TaskEntry:
+        check_settings(given, given.__name__)
+        return TaskEntry(given.__name__, summary_of(given), given())
+
+    def checked(self, entry: TaskEntry, place: str) -> TaskEntry:
+        default: object = entry.default
+        if not (isinstance(default, Task) and is_dataclass(type(default))):
+            raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got "
+                                     f"{type(default).__name__}")  # fmt: skip
+        return entry
 
 
-def find_task(name: str) -> TaskEntry:
-    """Return the task called `name`: of this package, of a file that the user gave, or published by others.
-
-    Raises:
-        ConfigurationError: no such task, or one of others that cannot be loaded.
-    """
-    if name in TASKS:
-        return TASKS[name]
-    for own in offered([name]):
-        if isinstance(own.entry, TaskEntry):
-            return own.entry
-    if name not in _published():
-        if Path(f"{name}.py").is_file():
-            raise ConfigurationError(f"unknown task {name!r}: did you mean your file './{name}.py'?")
-        raise ConfigurationError(f"unknown task {name!r}: {suggest(name, task_names())}")
-    return _load(name)
-
-
-def choose_task(text: str) -> str:
-    """Return the name of the task that a user names, or whose place is given, such as ./spiral.py or ./mine.py:Spiral.
-
-    Raises:
-        ConfigurationError: there is no such task, or it cannot be used; one line with file and line number.
-    """
-    if text not in task_names() and not offered([text]) and is_place(text):
-        own = read_own(TASK, text)
-        if own.name in task_names():
-            raise ConfigurationError(f"a task called {own.name!r} exists already; give yours another name, such as "
-                                     f"my_{own.name}={own.place}")  # fmt: skip
-        return offer(own)
-    find_task(text)
-    return text
-
-
-@cache
-def _published() -> dict[str, EntryPoint]:
-    """Return the tasks that other distributions publish; a name of this package cannot be taken over."""
-    return {point.name: point for point in entry_points(group=GROUP) if point.name not in (*TASKS, ALL, RUN)}
-
-
-def published_task(name: str) -> EntryPoint | None:
-    """Return the entry point of a task that another distribution publishes; None for other tasks."""
-    return _published().get(name)
-
-
-@cache
-def _load(name: str) -> TaskEntry:
-    point = _published()[name]
-    try:
-        given = point.load()
-    except (Exception, SystemExit) as error:
-        why = describe_import(error, point.module)
-        raise ConfigurationError(f"task {name!r} ({point.value}) cannot be loaded: {why}") from error
-    return _entry_of(given, point.value, name)
-
-
-def _entry_of(given: object, place: str, name: str | None) -> TaskEntry:
-    """Return the entry of a class of tasks, whose fields need defaults, or of an entry."""
-    if isinstance(given, TaskEntry):
-        entry = given
-    elif isinstance(given, type) and issubclass(given, Task):
-        check_class(given)
-        check_settings(given, place)
-        entry = TaskEntry(given.__name__, (given.__doc__ or given.__name__).strip().splitlines()[0], given())
-    else:
-        raise ConfigurationError(f"{place} is {given!r}, {TASK.wanted}")
-    default: object = entry.default
-    if not (isinstance(default, Task) and is_dataclass(type(default))):
-        raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got "
-                                 f"{type(default).__name__}")  # fmt: skip
-    return replace(entry, name=name or entry.name)
-
-
-TASK: Final[Kind[Any]] = Kind(
-    "task",
-    TaskEntry,
-    (Task,),
-    "setting",
-    "wanted a dataclass below servobench.Task or a servobench.TaskEntry",
-    lambda kind, _: _entry_of(kind, kind.__name__, None),
-    _entry_of,
-)
+TASK_REGISTRY: Final = Registry(_TaskKind(), "servobench.tasks", TASKS)
+find_task, choose_task, task_names = TASK_REGISTRY.find, TASK_REGISTRY.choose, TASK_REGISTRY.names
 
 
 def fitted(name: str, robot: Robot) -> Task:

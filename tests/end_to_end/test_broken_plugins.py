@@ -137,7 +137,9 @@ from servobench.harness.cli.main import main
 from servobench.harness.config import registry
 
 trials.TRIAL_LIMIT = trials.IMPORT_LIMIT = 4.0
-registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
+own = registry.CONTROLLER_REGISTRY.own
+for name in set(own) - {"ukf_mfac", "constant", "nmpc_calibrated"}:
+    del own[name]
 told = []
 for arguments in json.loads(sys.argv[1]):
     out, err = io.StringIO(), io.StringIO()

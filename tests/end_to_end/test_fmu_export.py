@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,24 @@ from servobench.fmus.compiler import (
     parse_platforms,
     this_platform,
 )
-from servobench.fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu, fingerprint
+from servobench.fmus.export import (
+    PACKAGES,
+    ExportOptions,
+    arm_layout,
+    default_actuation,
+    export_fmu,
+    fingerprint,
+    nominal_options,
+)
 from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.setups import PIXEL, pixels
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import JOINT_NAMES
 
@@ -99,14 +111,24 @@ def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["severe.fmu"]
 
 
-def test_the_fingerprint_changes_with_whatever_decides_how_the_fmu_behaves(monkeypatch):
+def test_the_fingerprint_changes_with_whatever_an_fmu_is_made_from(monkeypatch, tmp_path):
     plain = fingerprint(ExportOptions(2))
     assert fingerprint(ExportOptions(2)) == plain
     others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, mismatched("severe")))]
     others.append(fingerprint(ExportOptions(2, platforms=tuple(PLATFORMS.values()))))
-    monkeypatch.setattr("servobench.fmus.product.CODE", ("-O3",))
+    for measure in (pixels, lambda points, optics: 2.0 * pixels(points, optics)):
+        own = Sensing(replace(PIXEL, name="own", measure=measure))
+        others.append(fingerprint(nominal_options(2, find_robot("ur5"), own)))
+    monkeypatch.setattr("servobench.fmus.export.CODE", ("-O3",))
     others.append(fingerprint(ExportOptions(2)))
-    assert len({plain, *others}) == 5
+    packages = [Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in PACKAGES]
+    monkeypatch.setattr("servobench.fmus.export.PACKAGES", packages)
+    assert fingerprint(ExportOptions(2)) == others[-1]
+    for package, changed in zip(packages, ("fmi/instance.c", "cameras/symbolic.py"), strict=True):
+        with (package / changed).open("a") as file:
+            file.write("\n")
+        others.append(fingerprint(ExportOptions(2)))
+    assert len({plain, *others}) == 9
 
 
 EXPORT = """

@@ -116,22 +116,11 @@ def test_degenerate_samples_have_no_interval_or_one_of_no_width():
         median_with_interval([1.0, -np.inf])
 
 
-def test_one_value_is_a_sample_of_one_and_no_estimate_is_a_sample_of_none():
-    assert median_with_interval([2.5]).count == 1
-    assert NO_ESTIMATE.count == 0
-    assert f"{Estimate(1.0, 0.5, 1.5, 0):.1f}" == "–"
-
-
 def test_the_interval_of_a_mirrored_sample_is_the_mirrored_interval(monkeypatch):
     monkeypatch.setattr(statistics, "RESAMPLES", 60)  # hardly any ties
     sample = np.random.default_rng(4).normal(size=30)
     drawn, mirrored = (median_with_interval(values) for values in (sample, -sample))
     assert (mirrored.low, mirrored.value, mirrored.high) == (-drawn.high, -drawn.value, -drawn.low)
-
-
-def test_the_same_sample_gives_the_same_interval():
-    sample = np.random.default_rng(0).normal(size=30)
-    assert median_with_interval(sample) == median_with_interval(sample)
 
 
 @settings(max_examples=30, deadline=None)

@@ -15,8 +15,8 @@ from kit.command import judged
 from kit.command import servobench as command
 from kit.documents import blocks
 from kit.own import write
+from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
-from servobench.harness.run import tasks
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -59,6 +59,7 @@ def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(tmp_path
     assert command(monkeypatch, "tasks", "./spiral.py") == 0
     assert "Spiral.radius = 0.1" in capsys.readouterr().out
     options = ("--plants", "kinematic", "--controllers", "constant", "--tasks", "round=./spiral.py", "--out", "runs")
+    options += ("--workers", "1", "--no-report")
     assert command(monkeypatch, "compare", *options, "--set", "round.radius=0.2") == 0
     assert servobench.load("runs").runs["task"].unique().tolist() == ["round"]
 
@@ -109,7 +110,7 @@ def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
         "[servobench.tasks]\nspiral = spirals:Spiral\ncircle = spirals:Spiral\nlost = spirals:Lost\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    for function in (tasks._published, tasks._load):
+    for function in (registry._points, registry._load):
         function.cache_clear()
     try:
         assert find_task("spiral").summary == "A spiral from the middle of the image outwards."
@@ -120,5 +121,5 @@ def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
         assert run.row["status"] == "completed"
     finally:
         monkeypatch.undo()
-        for function in (tasks._published, tasks._load):
+        for function in (registry._points, registry._load):
             function.cache_clear()
