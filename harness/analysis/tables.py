@@ -36,7 +36,7 @@ from servobench.harness.analysis.statistics import (
     median_with_interval,
     tail_mean,
 )
-from servobench.harness.run.metrics import METRICS, Summary
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
 from servobench.harness.run.request import SECTIONS, SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
@@ -194,11 +194,15 @@ def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
-        kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        kind = (
+            CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        )  # its own metrics stand before the common ones
+        summaries = [(column, metric.summary) for wanted in (kind, None) for column, metric in METRICS.items()
+                     if metric.summary and metric.summary.kind == wanted]  # fmt: skip
         rows = []
         for name, own in place.groupby("controller", sort=False):
             row = {"controller": str(name), "outcome": _shares(own)}
-            for column, summary in _summaries(kind):
+            for column, summary in summaries:
                 unit, factor = shown_unit(column, place)
                 heading = summary.heading if unit == "1" else f"{summary.heading}\n{unit}"
                 row[heading] = _middle(own, column, factor, summary.digits)
@@ -206,12 +210,6 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
                     row[heading] += LATE
             rows.append(row)
         yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
-
-
-def _summaries(kind: str) -> list[tuple[str, Summary]]:
-    """Return the metrics of the summary of a kind of task, those of this kind only before those of all tasks."""
-    known = [(name, metric.summary) for name, metric in METRICS.items() if metric.summary]
-    return [pair for pair in known if pair[1].kind == kind] + [pair for pair in known if pair[1].kind is None]
 
 
 def _shares(runs: pd.DataFrame) -> str:

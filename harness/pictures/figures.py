@@ -153,9 +153,10 @@ def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, siz
     moves, runs, everything = group.select(point_to_point=True), group.runs, tuple(group.tasks)
     until = {task: shown_until(ensembles[task]) for task in everything}
     for words, part in _parts(moves, size):
-        tracks, over_seeds = {task: moves[task] for task in part}, {task: ensembles[task] for task in part}
-        yield _Plan("errors", words, part, partial(draw_moves, over_seeds, styles))
-        yield _Plan("features", words, part, partial(draw_features, tracks, until, styles))
+        yield _Plan("errors", words, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
+        yield _Plan(
+            "features", words, part, partial(draw_features, {task: moves[task] for task in part}, until, styles)
+        )
     heads = divisions(name for tracks in moves.values() for name in tracks)
     for words, part in _parts(moves, max(1, size // len(heads))):
         yield _Plan("paths", words, part, partial(draw_paths, {task: moves[task] for task in part}, styles))

@@ -6,7 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
@@ -53,14 +53,6 @@ Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 
 
-class _Dots(NamedTuple):
-    """A measure of the table of runs as it is drawn."""
-
-    column: str
-    label: str
-    factor: float
-
-
 def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
@@ -75,9 +67,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
         layout: of the figure; a narrow one is for a single task.
     """
     rows = [
-        _dots(name, runs)
-        for name, metric in METRICS.items()
-        if metric.figure == kind and name in runs and runs[name].notna().any()
+        name for name, metric in METRICS.items() if metric.figure == kind and name in runs and runs[name].notna().any()
     ]
     if not rows:
         return None
@@ -85,7 +75,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles)
     notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
     notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
-    if _never(runs, rows[0].column).any():
+    if _never(runs, rows[0]).any():
         notes.append("at the right edge and counted: never settled")
     if notes:
         words = textwrap.fill("; ".join(notes), round(LETTERS * layout.width))
@@ -93,7 +83,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     return figure
 
 
-def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -> Figure:
+def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles) -> Figure:
     """Draw measures of several tasks: a row a measure, a column a task."""
     tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
     height = 0.55 + LINE * max(LEAST_ROWS, len(names))
@@ -105,17 +95,17 @@ def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -
             _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
             axes.set_title(task)
             _name_rows(axes, names, WIDE)
-        part.supxlabel(row.label, fontsize=TEXT)
+        part.supxlabel(_label(row, runs), fontsize=TEXT)
     return figure
 
 
-def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
+def _draw_one_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: Layout) -> Figure:
     """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
-    rows = [row for row in rows if row.column != SETTLING or _moves(runs).any()] or rows[:1]
+    rows = [row for row in rows if row != SETTLING or _moves(runs).any()] or rows[:1]
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
     letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
-    words = [textwrap.fill(row.label, letters) for row in rows]
+    words = [textwrap.fill(_label(row, runs), letters) for row in rows]
     height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
     figure, panels = panel_grid(len(rows), height, layout, head=0.35)
     for axes, row, label in zip(panels, rows, words, strict=True):
@@ -193,15 +183,15 @@ def _short(milliseconds: float) -> str:
     return f"{1000.0 * milliseconds:.0f} µs" if milliseconds < 0.9995 else f"{milliseconds:.3g} ms"
 
 
-def _dots(column: str, runs: pd.DataFrame) -> _Dots:
-    unit, factor = shown_unit(column, runs)
-    name = METRICS[column].label
+def _label(column: str, runs: pd.DataFrame) -> str:
+    """Return the label of a metric with its unit; in a figure it has room for more words than in a table."""
+    unit, name = shown_unit(column, runs)[0], METRICS[column].label
     if column == "rms_error_evaluated":
         name = "RMS error of the judged part"
         name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""
     if column == "command_switches":
         name, unit = "sign switches of large commands", "count"
-    return _Dots(column, f"{name} [{unit}]", factor)
+    return f"{name} [{unit}]"
 
 
 def _moves(runs: pd.DataFrame) -> pd.Series[bool]:
@@ -214,12 +204,12 @@ def _never(runs: pd.DataFrame, column: str) -> pd.Series[bool]:
     return _moves(runs) & settling_times(runs).isna() & (column == SETTLING)
 
 
-def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, row: _Dots) -> None:
+def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str) -> None:
     """Draw a measure of the runs of one task."""
-    values, never = row.factor * runs[row.column].astype(float), _never(runs, row.column)
+    values, never = shown_unit(column, runs)[1] * runs[column].astype(float), _never(runs, column)
     floor = values.max() / MAX_RANGE
     values = values.where(~((values > 0.0) & (values < floor)), floor)
-    if row.column == SETTLING:
+    if column == SETTLING:
         values = values.where(_moves(runs) & ~never)
     if values.isna().all() and not never.any():
         axes.tick_params(axis="x", bottom=False, labelbottom=False)
@@ -236,7 +226,7 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
             face = style.colour if completed else "none"
             axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
                       markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
-        middle = values[own].fillna(math.inf).median() if row.column == SETTLING else values[own].median()
+        middle = values[own].fillna(math.inf).median() if column == SETTLING else values[own].median()
         if own.sum() > 1 and math.isfinite(middle):
             axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
         if never[own].any():
@@ -254,7 +244,7 @@ def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
     """
     largest, least = float(values.max()), float(values.min())
     if least > 0.0 and largest / least > WIDE_RANGE:
-        edge = largest * (largest / least) ** 0.08
+        edge = largest * float((largest / least) ** 0.08)
         plain_logarithms(axes, "x")
         axes.set_xlim(least / (edge / largest), edge)
         return edge

@@ -150,7 +150,7 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
         if len(points):
             axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
             if not track.completed:
-                mark_end(axes, *points.T, styles[name])
+                mark_end(axes, points[:, 0], points[:, 1], styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
     axes.plot(*start.T, color="black", marker="s", markersize=6, markerfacecolor="white", markeredgewidth=1.3,
               linestyle="", label="start", zorder=10)  # fmt: skip

@@ -194,15 +194,13 @@ def _asset(name: str) -> str:
 
 def _policy(style: str, scripts: list[str]) -> str:
     """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
-    styles, own = _digests([style]), _digests(scripts)
-    return (
-        f"default-src 'none'; img-src data:; style-src {styles}; script-src {own}; base-uri 'none'; form-action 'none'"
-    )
 
+    def digests(texts: list[str]) -> str:
+        found = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
+        return " ".join(f"'sha256-{digest}'" for digest in found)
 
-def _digests(texts: list[str]) -> str:
-    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
-    return " ".join(f"'sha256-{digest}'" for digest in digests)
+    own = f"style-src {digests([style])}; script-src {digests(scripts)}"
+    return f"default-src 'none'; img-src data:; {own}; base-uri 'none'; form-action 'none'"
 
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
@@ -252,14 +250,12 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
         "measures": [metric_heading(name, shown) for name in known],
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
-        "swatches": swatches([str(name) for name in dict.fromkeys(shown["controller"])]),
+        "swatches": {
+            name: {"colour": style.colour, "dash": _dash(style)}
+            for name, style in method_styles(shown["controller"].astype(str)).items()
+        },
         "views": views,
     }
-
-
-def swatches(names: list[str]) -> dict[str, Json]:
-    """Return colour and dashes of each controller's line as the page draws it."""
-    return {name: {"colour": style.colour, "dash": _dash(style)} for name, style in method_styles(names).items()}
 
 
 def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:

@@ -22,7 +22,7 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
-from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, Warm, linear_controller, warm_up
+from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, linear_controller, warm_up
 from servobench.harness.analysis.loops.systems import (
     POINTS,
     ArmModel,
@@ -285,9 +285,16 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
     """
     with one_thread():
         warm, name = warm_up(resolved), resolved.request.controller
+        arm, (m, n) = warm.arm, warm.arm.jacobian.shape
+        steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
-            return _linearised(name, warm, source)
-        return _identified(name, warm)
+            controller = linear_controller(warm, source)
+            closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
+            stable, step = is_stable(closed.A), closed.step(m, steps)
+            return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
+        loop = SmallMotions(warm.controller, arm, warm.rest)
+        response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
+        return LoopAnalysis(name, "identified", True, response.margins(), response, step_responses(loop, m, n, steps))
 
 
 def delay_margin(
@@ -364,23 +371,6 @@ def linear_response(controller: StateSpace, arm: ArmModel, points: int = POINTS)
     """Return the frequency response of a linear controller on an arm, at so many points."""
     axis, measured = frequencies(arm.period, points), sum(arm.jacobian.shape)
     return LoopResponse(axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm)
-
-
-def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
-    controller, arm = linear_controller(warm, source), warm.arm
-    closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
-    step = closed.step(len(arm.jacobian), round(STEP_DURATION / arm.period))
-    return LoopAnalysis(name, "linearised", is_stable(closed.A), response.margins(), response, step)
-
-
-def _identified(name: str, warm: Warm) -> LoopAnalysis:
-    arm = warm.arm
-    m, n = arm.jacobian.shape
-    loop = SmallMotions(warm.controller, arm, warm.rest)
-    frequency, controller = controller_response(excite(loop, m + n), arm.period)
-    response = LoopResponse(frequency, controller, arm)
-    step = step_responses(loop, m, n, round(STEP_DURATION / arm.period))
-    return LoopAnalysis(name, "identified", True, response.margins(), response, step)
 
 
 def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
