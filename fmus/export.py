@@ -14,7 +14,7 @@ import numpy as np
 from servobench.fmus.compiler import CODE, Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections
 from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
-from servobench.fmus.reference import COMMAND, reference_run, table
+from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import SetupModel
@@ -146,7 +146,6 @@ def product(options: ExportOptions) -> Product:
         sources=c_files(options.fmi_version, CORE),
         tool=tool(),
     )
-    run = reference_run(options.model, options.actuation)
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
@@ -155,7 +154,7 @@ def product(options: ExportOptions) -> Product:
         constants=arm_constants(layout),
         description=description,
         documentation=_documentation(layout, options),
-        reference=(table(run.time, {COMMAND: run.command}, layout), table(run.time, run.outputs, layout)),
+        reference=reference_run(options.model, options.actuation).tables(layout),
     )
 
 
