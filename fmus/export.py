@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-import casadi
 import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
@@ -121,7 +121,7 @@ def fingerprint(options: ExportOptions) -> str:
     numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [tool(), casadi.__version__, CODE, options.platforms, options.fmi_version]
+    parts: list[object] = [tool(), version("casadi"), CODE, options.platforms, options.fmi_version]
     parts += [options.title, options.identifier, options.summary]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]

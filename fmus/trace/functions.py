@@ -120,7 +120,7 @@ def _cumsum(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as
     sums = [rows[..., 0]]
     for k in range(1, rows.shape[-1]):
         sums.append(elementwise("add", sums[-1], rows[..., k]))
-    summed = np.stack(sums, axis=-1)
+    summed = _joining(np.stack)(sums, axis=-1)
     return summed if axis is None else summed.arranged(np.moveaxis(summed.places, -1, axis))
 
 
