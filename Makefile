@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-UNIT := tests/plant tests/controllers tests/fmus tests/harness
 RUNS ?= results/pages
 NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
@@ -12,9 +11,9 @@ run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
 	  --controllers map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
-# For every save: half a minute.
+# For every save: half a minute, without the tests that are marked slow.
 check: lint
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(UNIT)
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m "not slow"
 
 # For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
@@ -25,12 +24,12 @@ test: lint
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 
-# Too long for every change: whether each block of the first pages runs, whether the stored figures of these studies come out again,
+# Too long for every change: whether each block of the first pages runs and all methods do what some do in make test, whether the stored figures of these studies come out again,
 # whether FMPy runs exported loops as the harness does, whether a sweep with hostile controllers loses no run, and whether the unit
 # tests notice small faults in the code; writes nothing into the pages. Unnoticed faults are listed in results/mutation. The tools are
 # in benchmarks/night.
 nightly: $(VENV)/ready
-	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest tests/end_to_end/test_first_hour.py
+	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest $$(grep -rl kit.nightly tests --include 'test_*.py')
 	PYTHONPATH=tests:benchmarks $(BIN)/python -m pytest -p conftest benchmarks/night
 	$(NIGHT).fuzzing --inputs 1000000
 	$(NIGHT).random_calls --calls 10000000

@@ -9,9 +9,13 @@ import sys
 import tempfile
 from functools import cache
 
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read by numpy's import: threads of several processes wait for each other
+
 import numpy as np
 import pytest
 from hypothesis import settings
+
+WHOLE_FOLDERS = ("closed_loop", "end_to_end")  # whose tests are all slow
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
 settings.register_profile("servobench", deadline=None, derandomize=True)
@@ -25,6 +29,21 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the slow tests first, so that the quick ones fill the end of a run in several processes."""
+    for item in items:
+        if item.path.parent.name in WHOLE_FOLDERS:
+            item.add_marker("slow")
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one process more than there are processors, as some tests wait for other processes."""
+    return (os.cpu_count() or 1) + 1
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -41,6 +60,7 @@ def pytest_xdist_make_scheduler(config, log):
             path = nodeid.split("::", maxsplit=1)[0]
             return path if is_group(path) else nodeid
 
+    config.option.loadscopereorder = False  # the order is the one above
     return ByGroup(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 

@@ -38,7 +38,7 @@ from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
-from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
+from servobench.harness.cli.selection import split
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
@@ -240,13 +240,13 @@ WORDS: dict[str, Parser] = {
         4,
     ),
     "--robot": Parser(lambda text, _: find_robot(text), ("ur5", "panda"), ("~", "#", "/", "\0", "a.yaml", ".urdf"), 2),
-    "--plants": Parser(lambda text, _: split_plants(text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
+    "--plants": Parser(lambda text, _: split("plants", text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
     "--controllers": Parser(
-        lambda text, _: split_controllers(text),
+        lambda text, _: split("controllers", text),
         ("ukf_mfac,rbf_pid", "mfac+rls", "ukf_mfac:published"),
         (",", "+", ":", "=", ".py", "./", "\0", "mfac", "ukf"),
     ),
-    "--tasks": Parser(lambda text, _: split_tasks(text), ("exp1,circle", "all"), (",", "\0")),
+    "--tasks": Parser(lambda text, _: split("tasks", text), ("exp1,circle", "all"), (",", "\0")),
     "--platforms": Parser(
         lambda text, _: parse_platforms(text), ("x86_64-linux,aarch64-darwin", "all"), (",",), error=ValueError
     ),

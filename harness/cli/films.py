@@ -135,7 +135,6 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.batch.trials import choose
     from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
@@ -145,9 +144,8 @@ def _carried_out(new: NewRun) -> LoggedRun:
     from servobench.plant.rendered.settings import RenderedConfig
 
     names, settings = new.names(), read_settings(new.config, new.set_ or [])
-    plant, controller = choose("plant", names["plant"]), choose("controller", names["controller"])
-    chosen = {"plant": plant, "mismatch": read_mismatch(names["mismatch"]), "controller": controller}
-    request = RunRequest(**names | chosen)
+    chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
+    request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))

@@ -23,7 +23,7 @@ HELP = "Name whose settings to show."
 
 
 def plants(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_plants)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.PLANT.complete)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
@@ -38,7 +38,7 @@ def plants(
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_controllers)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.CONTROLLER.complete)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
@@ -58,7 +58,7 @@ def controllers(
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)] = None,
     robot: Annotated[
         str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
     ] = DEFAULT_ROBOT,
@@ -106,7 +106,8 @@ def init(
     from servobench.harness.run.resolution import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
 
-    names = selection.split_plants(plants), selection.split_controllers(controllers), selection.split_tasks(tasks)
+    split = selection.split
+    names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
     nominal = read_mismatch("none")
     requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()

@@ -93,7 +93,7 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, sett
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolution import check_settings, resolve
 
-    names = selection.split_controllers(",".join(controllers), robot)
+    names = selection.split("controllers", ",".join(controllers), robot=robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)
     return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]

@@ -40,13 +40,12 @@ class Value(NamedTuple):
         return Value(f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None)
 
 
-PLANT = Value("NAME", selection.complete_plants)
-CONTROLLER = Value("NAME", selection.complete_controllers)
-ESTIMATOR = Value("NAME", selection.complete_estimators)
-TASK = Value("NAME", selection.complete_tasks)
-MISMATCH = Value("NAME", selection.complete_mismatches)
-ROBOT = Value("NAME", selection.complete_robots, selection.known_robot)
-SENSING = Value("NAME", selection.complete_sensings, selection.known_sensing)
+PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH = (
+    Value("NAME", selection.completing(kind)) for kind in ("plants", "controllers", "estimators", "tasks", "mismatch")
+)
+ROBOT, SENSING = (
+    Value("NAME", selection.completing(kind), partial(selection.choose, kind)) for kind in ("robot", "sensing")
+)
 
 
 def option(
@@ -188,13 +187,13 @@ class Combinations:
         from servobench.harness.batch.plan import Batch, parse_seeds
 
         return Batch(
-            selection.split_plants(self.plants, robot=self.robot),
-            selection.split_controllers(self.controllers, self.robot),
-            selection.split_tasks(self.tasks),
-            selection.split_mismatches(self.mismatch),
+            selection.split("plants", self.plants, robot=self.robot),
+            selection.split("controllers", self.controllers, robot=self.robot),
+            selection.split("tasks", self.tasks),
+            selection.split("mismatch", self.mismatch),
             parse_seeds(self.seeds),
             self.robot,
-            selection.split_sensings(self.sensing),
+            selection.split("sensing", self.sensing),
         )
 
 

@@ -14,7 +14,7 @@ import typer
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, refuse, say
+from servobench.harness.cli.terminal import INTERRUPTED, console, print_rows, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,7 +38,7 @@ def run(
             metavar="CONTROLLER",
             help="Short for --controller.",
             show_default=False,
-            autocompletion=selection.complete_controllers,
+            autocompletion=CONTROLLER.complete,
         ),
     ] = None,
     *,
@@ -84,16 +84,27 @@ def run(
 
     if None not in (method, controller) and method != controller:
         refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
-    plant = selection.known_plant(plant)
+    plant = _default_plant() if plant is None else plant
+    plant = selection.choose("plants", plant)
     if view and plant != "bullet":
         refuse(f"--view shows the plant bullet only, got --plant {plant}")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
-    name = selection.known("controller", law if estimator is None else f"{law}+{estimator}")
+    name = selection.choose("controllers", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
     batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     _carry_out(campaign, out, how, with_report=with_report, strict=True)
+
+
+def _default_plant() -> str:
+    """Return the first of bullet, mujoco and kinematic that is installed, with a line if it is a second choice."""
+    from servobench.harness.config.registry import default_plant
+
+    name, why = default_plant()
+    if why:
+        say(f"no plant is named, so this run is on {name}: {why}")
+    return name
 
 
 def compare(
@@ -129,23 +140,21 @@ def train(
 
     They are trained on the nominal model and kept for later runs. Prints their errors.
     """
-    from rich.table import Table
-
-    from servobench.harness.batch.trials import choose
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.knowledge import NETWORKS
     from servobench.harness.run.resolution import check_settings
     from servobench.plant.contract.cache import cache_folder
 
-    settings, controller = overrides.settings(), choose("controller", controller)
+    settings, controller = overrides.settings(), selection.choose("controllers", controller)
     check_settings(settings, [controller])
     with telling(console, "training") as tell:
         trained = train_networks(controller, settings, tell, robot, sensing)
-    table = Table("network", "held-out error")
-    table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
-    table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
-    console.print(table)
+    errors = {
+        "Jacobian: RMS of its error over RMS of itself": f"{100 * trained.jacobian_error:.2f} %",
+        "controller: RMS error of the commanded joint position": f"{trained.controller_error:.2e} rad",
+    }
+    print_rows(("network", "held-out error"), errors.items())
     say(f"kept in {cache_folder(NETWORKS)}")
 
 

@@ -1,68 +1,82 @@
-"""Names of plants, controllers, tasks, robots, sensing and mismatches: completed by shells, split and looked up."""
+"""Names of plants, controllers, tasks, robots, sensing and mismatches: completed by shells, looked up and split."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.cli.terminal import refuse, say
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.trials import Tried, Word
+    from servobench.harness.batch.trials import Word
+
+ALL = "all"
 
 
-def complete_plants(incomplete: str) -> list[str]:
-    """Return the plants whose names begin so."""
-    from servobench.harness.config.registry import plant_names
+class Names(NamedTuple):
+    """The names of a kind.
 
-    return _matching(incomplete, plant_names())
+    Attributes:
+        known: returns all of them.
+        find: refuses a wrong word; a text that it returns is the name that the word stands for.
+        tried: the kind of plants and controllers, of which those of third parties are tried where `all` stands for
+            them; None for other kinds.
+        begun: returns the names that a shell offers for a word, where names are put together from parts.
+    """
+
+    known: Callable[[], Sequence[str]]
+    find: Callable[[str], Any]
+    tried: Word | None = None
+    begun: Callable[[str], Iterable[str]] | None = None
 
 
-def complete_controllers(incomplete: str) -> list[str]:
-    """Return the controllers whose names begin so; after `law+` the pairs with this law."""
+@cache
+def names_of(kind: str) -> Names:
+    """Return the names of a kind: plants, controllers, estimators, tasks, mismatch, robot or sensing."""
     from servobench.controllers.parts import ESTIMATORS
-    from servobench.harness.config.registry import controller_names
-
-    law, plus, _ = incomplete.partition("+")
-    return _matching(incomplete, [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names())
-
-
-def complete_tasks(incomplete: str) -> list[str]:
-    """Return the tasks whose names begin so."""
-    from servobench.harness.run.tasks import task_names
-
-    return _matching(incomplete, task_names())
-
-
-def complete_sensings(incomplete: str) -> list[str]:
-    """Return the sensing set-ups whose names begin so."""
-    from servobench.harness.config.robots import sensing_names
-
-    return _matching(incomplete, sensing_names())
-
-
-def complete_estimators(incomplete: str) -> list[str]:
-    """Return the estimators whose names begin so."""
-    from servobench.controllers.parts import ESTIMATORS
-
-    return _matching(incomplete, ESTIMATORS)
-
-
-def complete_mismatches(incomplete: str) -> list[str]:
-    """Return the profiles and axes of mismatch whose names begin so; after a `+` the axes."""
+    from servobench.harness.batch.trials import choose
+    from servobench.harness.config.registry import controller_names, plant_names
+    from servobench.harness.config.robots import find_robot, find_sensing, robot_names, sensing_names
+    from servobench.harness.run.request import read_mismatch
+    from servobench.harness.run.tasks import choose_task, task_names
     from servobench.plant.robot.mismatch import AXES, PROFILES
 
-    before, plus, last = incomplete.rpartition("+")
-    axes = [f"{axis}=" for axis in AXES]
-    return [before + plus + name for name in _matching(last, axes if plus else [*PROFILES, *axes])]
+    def robot(word: str) -> str:
+        if note := find_robot(word).note:
+            say(note)
+        return word
+
+    def controllers(word: str) -> Iterable[str]:
+        law, plus, _ = word.partition("+")
+        return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
+
+    def mismatches(word: str) -> Iterable[str]:
+        before, plus, _ = word.rpartition("+")
+        axes = [f"{before}{plus}{axis}=" for axis in AXES]
+        return axes if plus else [*PROFILES, *axes]
+
+    return {
+        "plants": Names(plant_names, partial(choose, "plant"), "plant"),
+        "controllers": Names(controller_names, partial(choose, "controller"), "controller", controllers),
+        "estimators": Names(lambda: list(ESTIMATORS), str),
+        "tasks": Names(task_names, choose_task),
+        "mismatch": Names(lambda: list(PROFILES), read_mismatch, begun=mismatches),
+        "robot": Names(robot_names, robot),
+        "sensing": Names(sensing_names, find_sensing),
+    }[kind]
 
 
-def complete_robots(incomplete: str) -> list[str]:
-    """Return the robots whose names begin so."""
-    from servobench.harness.config.robots import robot_names
+def completing(kind: str) -> Callable[[str], list[str]]:
+    """Return a function that completes a name of a kind."""
 
-    return _matching(incomplete, robot_names())
+    def complete(incomplete: str) -> list[str]:
+        names = names_of(kind)
+        offered = names.known() if names.begun is None else names.begun(incomplete)
+        return _matching(incomplete, offered)
+
+    return complete
 
 
 def completing_lists(complete: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
@@ -70,7 +84,7 @@ def completing_lists(complete: Callable[[str], list[str]]) -> Callable[[str], li
 
     def complete_last(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")
-        words = complete(last) + _matching(last, ["all"] * (not comma))
+        words = complete(last) + _matching(last, [ALL] * (not comma))
         return [before + comma + word for word in words]
 
     return complete_last
@@ -80,54 +94,46 @@ def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-def known_robot(name: str) -> str:
-    """Return the name of a robot that can be found, and print the assumptions made about it."""
-    from servobench.harness.config.robots import find_robot
-
-    note = find_robot(name).note
-    if note:
-        say(note)
+def choose(kind: str, word: str) -> str:
+    """Return the name of a kind that a user named, or whose place was given; a wrong one is refused."""
+    names = names_of(kind)
+    name = _chosen(names.find, word)
+    _tell_unused(names, [name])
     return name
 
 
-def known_sensing(name: str) -> str:
-    """Return the name of a sensing set-up that can be found; a mistyped one is refused."""
-    from servobench.harness.config.robots import find_sensing
+def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tuple[str, ...]:
+    """Return the names of a kind in a comma-separated list, each looked up.
 
-    find_sensing(name)
-    return name
-
-
-def known_plant(text: str | None) -> str:
-    """Return the name of the plant of a run, given by name or file; for None the default, with a line if second choice.
-
-    The default is the first of bullet, mujoco and kinematic that is installed.
+    Args:
+        kind: see `names_of`.
+        text: the list; `all` in it stands for all names that can be used.
+        option: by which it was given, if not by one called as the kind.
+        robot: for which plants and controllers of third parties are tried.
     """
-    from servobench.harness.config.registry import default_plant
+    from servobench.harness.batch.trials import try_all
 
-    if text is not None:
-        return known("plant", text)
-    name, why = default_plant()
-    if why:
-        say(f"no plant is named, so this run is on {name}: {why}")
-    tell_unused("plant", [name])
-    return name
+    names = names_of(kind)
 
+    def usable() -> Iterable[str]:
+        if names.tried is None:
+            return names.known()
+        found = try_all(names.tried, robot)
+        for each in found:
+            if each.fault:
+                sys.stderr.write(f"servobench: left out: {each.fault}\n")
+        return [each.name for each in found if not each.fault]
 
-def known(word: Word, text: str) -> str:
-    """Return the name of the plant or controller of a run, given by name or file."""
-    from servobench.harness.batch.trials import choose
-
-    name = choose(word, text)
-    tell_unused(word, [name])
-    return name
+    chosen = split_names(option or kind, text, names.known(), names.find, usable)
+    _tell_unused(names, split_words(text))
+    return chosen
 
 
-def tell_unused(word: Word, named: Sequence[str]) -> None:
+def _tell_unused(names: Names, named: Sequence[str]) -> None:
     """Print a line for each entry point that is not used though a user named it, or all."""
-    from servobench.harness.config.registry import ALL, REGISTRIES
+    from servobench.harness.config.registry import REGISTRIES
 
-    for name, line in REGISTRIES[word].unused_points():
+    for name, line in REGISTRIES[names.tried].unused_points() if names.tried else ():
         if name in named or ALL in named:
             sys.stderr.write(f"servobench: note: {line}\n")
 
@@ -137,73 +143,36 @@ def split_words(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
-    """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
-    if text.strip() == "all":
-        return tuple(known)
-    names = split_words(text)
+def split_names(
+    option: str,
+    text: str,
+    known: Sequence[str],
+    find: Callable[[str], Any],
+    usable: Callable[[], Iterable[str]] | None = None,
+) -> tuple[str, ...]:
+    """Split a comma-separated list of names, and refuse an empty one and a name that stands in it twice.
+
+    Args:
+        option: by which it was given, without dashes.
+        text: the list.
+        known: all names.
+        find: see `Names`.
+        usable: returns the names that `all` stands for; None for those that are known.
+    """
+    names: list[str] = []
+    for word in split_words(text):
+        if word == ALL:
+            names += known if usable is None else usable()
+        else:
+            names.append(_chosen(find, word))
     if not names:
-        refuse(f"--{kind} is empty; valid: {', '.join(known)}")
+        refuse(f"--{option} is empty; valid: {', '.join(known)}")
     for name in names:
-        find(name)
-    refuse_repetition(kind, names)
-    return names
+        if names.count(name) > 1:
+            refuse(f"--{option} names {name} twice")
+    return tuple(names)
 
 
-def refuse_repetition(option: str, values: Sequence[object]) -> None:
-    """Refuse a list that names something twice."""
-    for value in values:
-        if values.count(value) > 1:
-            refuse(f"--{option} names {value} twice")
-
-
-def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
-    """Return the names of plants given by name or by file, such as ./cell.py:Cell."""
-    return _split_entries("plant", text, option, robot)
-
-
-def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
-    """Return the names of controllers given by name or by file, such as ./mine.py:Mine."""
-    return _split_entries("controller", text, "controllers", robot)
-
-
-def _split_entries(word: Word, text: str, option: str, robot: str) -> tuple[str, ...]:
-    from servobench.harness.batch.trials import choose, try_all
-    from servobench.harness.config.registry import ALL, REGISTRIES
-
-    registry, names = REGISTRIES[word], list[str]()
-    for part in split_words(text):
-        names += _usable(try_all(word, robot)) if part == ALL else [choose(word, part)]
-    tell_unused(word, split_words(text))
-    return split_names(option, ",".join(names), registry.names(), registry.find)
-
-
-def _usable(all_of_them: Sequence[Tried]) -> list[str]:
-    """Return the names of those that can be used; print a line for each other."""
-    for each in all_of_them:
-        if each.fault:
-            sys.stderr.write(f"servobench: left out: {each.fault}\n")
-    return [each.name for each in all_of_them if not each.fault]
-
-
-def split_tasks(text: str) -> tuple[str, ...]:
-    """Return the names of tasks, each looked up."""
-    from servobench.harness.run.tasks import choose_task, find_task, task_names
-
-    words = [word if word == "all" else choose_task(word) for word in split_words(text)]
-    return split_names("tasks", ",".join(words), task_names(), find_task)
-
-
-def split_mismatches(text: str) -> tuple[str, ...]:
-    """Return mismatches, each read, so that a mistyped one is refused at once."""
-    from servobench.harness.run.request import read_mismatch
-    from servobench.plant.robot.mismatch import PROFILES
-
-    return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
-
-
-def split_sensings(text: str) -> tuple[str, ...]:
-    """Return the names of sensing set-ups, each looked up."""
-    from servobench.harness.config.robots import find_sensing, sensing_names
-
-    return split_names("sensing", text, sensing_names(), find_sensing)
+def _chosen(find: Callable[[str], Any], word: str) -> str:
+    found = find(word)
+    return found if isinstance(found, str) else word

@@ -121,14 +121,14 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
-    """Return the fields of a configuration dataclass by dotted key."""
+    """Return the fields of a configuration dataclass, or settings by nested keys, by dotted key."""
     flat: dict[str, Any] = {}
-    for item in fields(config):
-        value = getattr(config, item.name)
-        if is_dataclass(value):
-            flat.update(flatten(value, f"{prefix}{item.name}."))
+    values = {each.name: getattr(config, each.name) for each in fields(config)} if is_dataclass(config) else config
+    for name, value in values.items():
+        if is_dataclass(value) or (config is values and isinstance(value, Mapping)):
+            flat.update(flatten(value, f"{prefix}{name}."))
         else:
-            flat[prefix + item.name] = value
+            flat[prefix + name] = value
     return flat
 
 

@@ -13,7 +13,6 @@ from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, r
 from servobench import controllers
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.studies.tuning.campaign import (
-    StudyRecord,
     TuningPlan,
     advance,
     open_methods,
@@ -26,7 +25,14 @@ from servobench.harness.studies.tuning.objective import (
     score,
 )
 from servobench.harness.studies.tuning.scoring import Ledger, fill, open_ledger
-from servobench.harness.studies.tuning.search import ACCEPTED, changes, coordinate_search, first_points, neighbours
+from servobench.harness.studies.tuning.search import (
+    ACCEPTED,
+    StudyRecord,
+    changes,
+    coordinate_search,
+    first_points,
+    neighbours,
+)
 from servobench.harness.studies.tuning.spaces import (
     default_values,
     find_tunable,
@@ -106,7 +112,7 @@ def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
     (method,) = carried_out(tmp_path, plan_of("broyden", trials=trials))
     assert made_up[0][2] == str(find_tunable("broyden").config())
     assert len(method.ledger) == trials
-    assert method.studies[0].outcome.found.evaluations == 0
+    assert method.studies[0].outcome.search_points == 0
 
 
 def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still_better_ones(made_up, tmp_path):
@@ -114,13 +120,14 @@ def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still
     few = outcomes(tmp_path / "few", plan_of("broyden", trials=known))[0][0]
     more = outcomes(tmp_path / "more", plan_of("broyden", trials=known + 25, search=120))[0][0]
     assert more.best_trial >= known
-    assert more.found.score < more.best_trial_score < few.best_trial_score
+    assert more.score < more.best_trial_score < few.best_trial_score
 
 
 def test_a_campaign_taken_up_again_is_that_which_was_never_interrupted(made_up, tmp_path):
     whole = outcomes(tmp_path / "whole", plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6))
     once = len(made_up)
     part = plan_of("ukf_mfac", "broyden", trials=12, studies=2, search=6)
+    (tmp_path / "parts").mkdir()
     halfway = advance(open_methods(tmp_path / "parts", part), part, Workers())
     for _ in range(25):  # leaves in the middle of a round, as a kill does
         next(halfway)
@@ -143,7 +150,7 @@ def test_each_study_has_a_sampler_of_its_own_that_the_seed_decides(made_up, tmp_
 def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_out(made_up, tmp_path):
     ledger = open_ledger(tmp_path, "rls", SMALL)
     point = {**default_values(find_tunable("rls")), "estimator.forgetting": 7.0}
-    assert list(fill([(ledger, "rls", point)], SMALL, Workers())) == ["rls"]
+    assert list(fill([(ledger, "rls", nested_settings(point))], SMALL, Workers())) == ["rls"]
     assert score(ledger.costs(nested_settings(point))) == pytest.approx(WORST)
     assert not made_up
 
@@ -152,7 +159,7 @@ def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_o
 def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(made_up, tmp_path, gain, runs):
     ledger = open_ledger(tmp_path, "constant", SMALL)
     point = {**default_values(find_tunable("constant")), "law.proportional_gain": gain}
-    assert list(fill([(ledger, "constant", point)], SMALL, Workers())) == ["constant"]
+    assert list(fill([(ledger, "constant", nested_settings(point))], SMALL, Workers())) == ["constant"]
     assert len(made_up) == runs
     assert (score(ledger.costs(nested_settings(point))) == pytest.approx(WORST)) == (runs == 0)
 

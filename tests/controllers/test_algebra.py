@@ -37,15 +37,6 @@ def test_the_projection_is_that_of_the_pseudo_inverse_however_close_to_singular(
     np.testing.assert_allclose(kept, rows @ rows.T, atol=max(1e-9, rounding))
 
 
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6, 1e12])
-def test_the_damped_inverse_is_the_ridge_solution_at_any_size_of_the_jacobian(size):
-    J = size * np.random.default_rng(3).normal(size=(3, 6))
-    e = np.array([0.1, -0.2, 0.3])
-    stacked = np.vstack([J, 0.02 * np.eye(6)])
-    wanted = np.linalg.lstsq(stacked, np.concatenate([e, np.zeros(6)]), rcond=None)[0]
-    np.testing.assert_allclose(damped_inverse(J, 0.02) @ e, wanted, rtol=1e-9)
-
-
 @settings(max_examples=100)
 @given(seed=st.integers(0, 10**6), exponent=st.floats(-4.0, 8.0), damping=st.floats(1e-3, 1.0))
 def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
@@ -61,11 +52,6 @@ def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():
     for lane, single in enumerate((ordinary, huge, ordinary)):
         np.testing.assert_array_equal(both[lane], damped_inverse(single, 0.02))
     np.testing.assert_allclose(both[1], damped_inverse_by_svd(huge, 0.02), rtol=1e-6)
-
-
-def test_the_damped_inverse_exists_where_the_jacobian_is_huge_and_singular():
-    J = 1e9 * np.ones((2, 2))
-    assert np.isfinite(damped_inverse(J, 0.02)).all()
 
 
 def test_a_posture_moves_the_joints_towards_it_and_the_feature_not_at_all():

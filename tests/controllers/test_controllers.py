@@ -4,7 +4,6 @@ Pairs of a law and an estimator are tested along one row and one column of their
 """
 
 import dataclasses
-import pickle
 
 import casadi
 import numpy as np
@@ -14,9 +13,7 @@ from hypothesis import strategies as st
 
 from kit.toy import plant_spec, seen
 from servobench.controllers import nmpc_calibrated
-from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.methods import METHODS, PUBLISHED, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
@@ -161,47 +158,11 @@ def test_what_is_of_the_wrong_size_or_not_finite_is_refused(entry):
             refused(*arguments)
 
 
-@pytest.mark.parametrize("entry", ALL)
-def test_settings_can_be_pickled(entry):
-    assert pickle.loads(pickle.dumps(default_config(entry))) == default_config(entry)
-
-
-def test_only_the_calibrated_method_needs_the_truth():
-    assert [name for name, entry in METHODS.items() if entry.needs_truth] == ["calibrated"]
+def test_what_needs_the_truth_is_refused_without_it():
     assert compose("mfac", "true").needs_truth
     knowledge = dataclasses.replace(robot(3, 2, 0), true_jacobian=None)
     with pytest.raises(ValueError, match="true_jacobian must be known"):
         METHODS["calibrated"].build(METHODS["calibrated"].config(), knowledge)
-
-
-def test_the_kalman_filter_commands_what_the_unscented_one_does():
-    knowledge, (unscented, kalman) = robot(6, 3, 11), (METHODS["ukf_mfac:published"], compose("mfac", "kalman"))
-    sigma_points = dataclasses.replace(unscented.config(), estimator=UkfConfig(form="sigma_points"))
-    runs = [
-        random_run(entry.build(config, knowledge), knowledge.spec, 5, 0.5, steps=60)
-        for entry, config in ((unscented, sigma_points), (kalman, kalman.config()))
-    ]
-    for (u, J, _), (u_kalman, J_kalman, _) in zip(*runs, strict=True):
-        np.testing.assert_allclose(u, u_kalman, atol=1e-9)
-        np.testing.assert_allclose(J, J_kalman, atol=1e-9)
-
-
-def test_a_row_of_the_table_may_change_defaults_of_its_law():
-    assert METHODS["ukf_mpc:published"].config().law.mode == "constant"
-    assert METHODS["ukf_mpc"].config().law == compose("mpc", "ukf").config().law
-    assert METHODS["map_mfac"].config().law.gain > 5.0 * compose("mfac", "constant").config().law.gain
-
-
-def test_published_means_no_aids_and_plain_names_bring_all_that_their_laws_do_not():
-    published = [name for name in METHODS if name.endswith(":published")]
-    assert len(published) == 7
-    for name in published:
-        assert METHODS[name].config().aids == AidsConfig() == compose("pid", "rls").config().aids
-        aids = METHODS[name.removesuffix(":published")].config().aids
-        assert (aids.delay, aids.response, aids.noise, aids.model) == ("identified", "identified", "identified", "map")
-        assert aids.filter
-    assert METHODS["constant"].config().aids == AidsConfig()
-    assert METHODS["calibrated"].config().aids.delay == METHODS["calibrated"].config().aids.response == "given"
 
 
 def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
@@ -213,10 +174,3 @@ def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
         "aids",
     ]
     assert hasattr(compose("pid", "rbf").config(), "training")
-
-
-def test_an_unknown_part_is_refused_with_the_valid_choices():
-    with pytest.raises(ValueError, match=r"law must be one of .*mfac.*pid.*, got 'lqr'"):
-        compose("lqr", "rls")
-    with pytest.raises(ValueError, match=r"estimator must be one of .*ukf, got 'ekf'"):
-        compose("pid", "ekf")

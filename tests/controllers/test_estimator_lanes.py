@@ -9,6 +9,7 @@ from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.parts import ESTIMATORS
+from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import trusted_observation
 
@@ -89,6 +90,19 @@ def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
         state = estimator.start(np.ones((M, N)))
         way = Motion(np.zeros(N), length * np.eye(N)[1], np.full(M, 0.1), np.zeros(M), np.asarray(PERIOD)[()])
         assert bool(estimator.diagnostics(estimator.update(state, way))["estimator_updated"]) == counts
+
+
+FILTERS = [each for each in SETTINGS if hasattr(made(*each).start(np.ones((M, N))), "P")]
+
+
+@pytest.mark.parametrize(("name", "changes"), FILTERS, ids=lambda part: part if isinstance(part, str) else "")
+@pytest.mark.parametrize("factor", [-1.0, np.nan])
+def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(name, changes, factor):
+    estimator = made(name, changes)
+    state = estimator.start(np.ones((M, N)))
+    way = Motion(np.zeros(N), np.full(N, 0.3), np.zeros(M), np.zeros(M), np.asarray(PERIOD)[()])
+    with pytest.raises(FilterDiverged, match="covariance is not"), np.errstate(invalid="ignore"):
+        estimator.update(state._replace(P=factor * state.P), way)
 
 
 def test_estimators_say_which_of_them_bring_a_model():

@@ -57,12 +57,6 @@ def test_the_scores_are_the_likelihood_of_the_motions():
     np.testing.assert_allclose(score, -2.0 * density, rtol=1e-12)
 
 
-def test_without_noise_of_frames_the_filter_is_the_least_squares_of_numpy():
-    x, dy, _ = motions(40, 3)
-    bank, _ = filtered(x, dy, np.ones(40), 1e9 * np.eye(3), frame=1e-12)
-    np.testing.assert_allclose(bank[:3, :3], np.linalg.lstsq(x, dy, rcond=None)[0].T, atol=1e-6)
-
-
 def test_one_update_by_hand_and_every_candidate_on_its_own():
     """s = 1 + 4·2² + 1 = 18 with P_ee = σ² = 1, gain = 4·2/18, ν = 5 − 2 = 3; the other sees x = 0 and s = 2."""
     bank = np.stack([fresh_bank(np.eye(1), np.array([[4.0]]), 1.0)] * 2)

@@ -94,19 +94,6 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
     np.testing.assert_allclose(held[:2], [1.0, 0.0], atol=1e-4)
 
 
-def test_every_lane_is_finished_as_if_it_were_alone():
-    rng = np.random.default_rng(0)
-    wanted, q, J = 1.5 * rng.normal(size=(3, N)), rng.normal(size=(3, N)), A + 0.1 * rng.normal(size=(3, M, N))
-    forward = 0.01 * rng.normal(size=(3, M))
-    for limit in ("scale", "clip", "redistribute"):
-        aids = {"feedforward": True, "posture": True, "limit": limit}
-        together, limited = finish(wanted, q, forward, J, **aids)
-        for lane in range(3):
-            u, one = finish(wanted[lane], q[lane], forward[lane], J[lane], **aids)
-            np.testing.assert_array_equal(u, together[lane])
-            assert one == limited[lane]
-
-
 def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
     """Both move the feature by 1 m/rad; (0.3, 0.1) wants 0.4 m, scaled to (0.1, 0.033); the second goes on to 0.1."""
     dq = redistribute(np.array([0.3, 0.1]), np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9)

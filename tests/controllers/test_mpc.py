@@ -343,16 +343,6 @@ def test_a_jacobian_of_zeros_asks_for_nothing():
         )
 
 
-def test_diagnostics_tell_the_predicted_error_of_the_plan():
-    spec = make_spec(1, 1, speed=100.0)
-    law = make_law(spec, **blocks(3), decay=0.4 / PERIOD, move_weight=1e-10)
-    law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.5]))
-    diagnostics = law.diagnostics()
-    assert diagnostics["predicted_terminal_error"] == pytest.approx(np.exp(-1.2) * 0.5, rel=1e-6)
-    assert diagnostics["objective"] == pytest.approx(0.0, abs=1e-9)
-    assert diagnostics["active_limits"] == 0
-
-
 def test_the_predicted_error_is_from_the_reference_at_the_end_of_the_horizon():
     spec = make_spec(1, 1, speed=100.0)
     law = make_law(spec, **blocks(4), decay=0.4 / PERIOD)
@@ -360,17 +350,6 @@ def test_the_predicted_error_is_from_the_reference_at_the_end_of_the_horizon():
     law.command(Estimate(np.array([[1.0]])), observe(spec, feature=[0.2]), ramp)
     missed = ramp[4, 0] - 0.2 - law.state.plan.moves.sum()
     assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(abs(missed), rel=1e-12)
-
-
-def test_the_objective_of_a_constant_move_is_that_of_the_least_of_a_parabola():
-    spec = make_spec(4, 3, speed=100.0)
-    law = make_law(spec, mode="constant", **blocks(5))
-    J = random_jacobian(2, 3, 4)
-    law.command(Estimate(J), observe(spec), hold([0.01, 0.02, -0.01]))
-    moved = (law.state.targets * (law.state.plan.moves @ J.T)).sum()
-    assert law.diagnostics()["active_limits"] == 0
-    assert moved > 0.0
-    assert law.diagnostics()["objective"] == pytest.approx(-0.5 * moved, rel=1e-9)
 
 
 def test_settings_that_do_not_fit_the_plant_are_named():

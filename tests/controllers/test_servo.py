@@ -209,13 +209,3 @@ def test_an_aid_that_the_law_brings_or_that_lacks_a_preview_is_refused_in_one_li
     knowledge = KNOWLEDGE if law else dataclasses.replace(KNOWLEDGE, preview=0)
     with pytest.raises(ValueError, match=f"^{message}$"):
         servo(ConstantEstimator(), law, aids, knowledge)
-
-
-def test_the_law_notes_what_is_sent():
-    law = MpcLaw(MpcConfig(use_preview=False, moves=1), KNOWLEDGE)
-    controller = servo(Recorder(), law)
-    first = seen(np.zeros(3), np.zeros(2))
-    controller.reset(first, 0)
-    sent = controller.step(first, np.full((2, 2), 0.3)).joint_velocity
-    assert np.abs(sent).max() > 0.0
-    np.testing.assert_allclose(controller.save().law.last, sent * KNOWLEDGE.spec.period, rtol=1e-12)

@@ -25,20 +25,14 @@ def test_loops_are_analysed_side_by_side(monkeypatch, capsys, tmp_path):
     assert figures == ["loops.pdf", "loops.png", "stability_map.pdf", "stability_map.png"]
 
 
-def test_every_loop_can_be_identified(monkeypatch, capsys, tmp_path):
-    assert servobench(monkeypatch, "analyse", "pid+true", "--identify", "--out", str(tmp_path)) == 0
-    assert "identified in small motions" in capsys.readouterr().out
-    table = pd.read_csv(tmp_path / "analyse.csv")
-    assert table["model"].tolist() == ["identified"]
-
-
-def test_the_loop_of_another_arm_is_analysed(monkeypatch, tmp_path):
-    tables = []
-    for robot in ("ur5", "panda"):
-        out = tmp_path / robot
-        asked = ["broyden", "--jacobian", "nominal", "--mismatch", "moderate", "--robot", robot, "--out", str(out)]
+def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(monkeypatch, capsys, tmp_path):
+    margins = []
+    for robot, how in (("ur5", ("--jacobian", "nominal")), ("panda", ("--identify",))):
+        identified = "--identify" in how
+        asked = ["pid+constant", "--mismatch", "moderate", "--robot", robot, "--out", str(tmp_path / robot), *how]
         assert servobench(monkeypatch, "analyse", *asked) == 0
-        tables.append(pd.read_csv(out / "analyse.csv"))
-    margins = [table["delay_margin_s"].iloc[0] for table in tables]
-    assert margins[1] > 0.0
-    assert margins[0] != margins[1]
+        assert ("identified in small motions" in capsys.readouterr().out) == identified
+        table = pd.read_csv(tmp_path / robot / "analyse.csv")
+        assert table["model"].tolist() == ["identified" if identified else "linearised"]
+        margins.append(table["delay_margin_s"].iloc[0])
+    assert 0.0 < margins[1] != margins[0]

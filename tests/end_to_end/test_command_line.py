@@ -15,23 +15,6 @@ from kit.command import judged, servobench
 from kit.plants import NEEDS_BULLET
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("plants",), ("kinematic", "bullet")),
-        (("controllers",), ("constant", "calibrated", "ukf_mfac")),
-        (("tasks",), ("exp1", "circle", "random", "waypoints")),
-        (("controllers", "ukf_mfac"), ("ukf_mfac.law.step_weight", "ukf_mfac.estimator.feature_noise")),
-        (("plants", "kinematic"), ("kinematic.lag", "0.05")),
-    ],
-)
-def test_what_there_is_can_be_listed(monkeypatch, capsys, arguments, words):
-    assert servobench(monkeypatch, *arguments) == 0
-    shown = capsys.readouterr().out
-    for word in words:
-        assert word in shown
-
-
 def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_path):
     out = tmp_path / "out"
     arguments = ["run", "--plant", "kinematic", "--controller", "calibrated", "--task", "exp2", "--seed", "3"]

@@ -19,6 +19,7 @@ import pytest
 from kit import console
 from kit.command import PACKAGE
 from kit.documents import DOCS, blocks, read
+from kit.nightly import NIGHTLY
 from kit.robots import calibration_text, odd_urdf
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
@@ -41,7 +42,6 @@ LEFT_OUT = {  # words of a block -> why it is not carried out
     "train_policy.py": "trains for two minutes with a library that servobench does not need",
     "mine.toml --plants": "needs the FMU of a controller; test_fmu_controller.py closes loops with some",
 }
-NIGHTLY = "SERVOBENCH_NIGHTLY"  # the environment variable that `make nightly` sets
 LONG = {  # words of a block that only `make nightly` carries out -> processor time [s]
     "servobench record --robot panda": 90,
     "for arm in": 85,
@@ -74,7 +74,7 @@ class Shell:
     def paste(self, kind: str, block: str) -> None:
         """Carry out a block of shell or Python, unless it is one of those that are left out."""
         self.seen.append(block)
-        left_out = LEFT_OUT if NIGHTLY in os.environ else LEFT_OUT | LONG
+        left_out = LEFT_OUT if NIGHTLY else LEFT_OUT | LONG
         if any(words in block for words in left_out):
             return
         line = ["bash", "-e", "-c", block] if kind == "shell" else [sys.executable, "-c", block]

@@ -128,11 +128,6 @@ def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
         release.quiet(Path(sys.executable), "-c", "raise SystemExit(3)", folder=tmp_path)
 
 
-def test_the_package_is_a_command():
-    done = subprocess.run([sys.executable, "-m", "servobench", "--help"], capture_output=True, text=True, check=True)
-    assert "compare" in done.stdout
-
-
 def test_the_citation_is_one_of_its_format(tmp_path):
     check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.citation-file-format"]
     done = subprocess.run([*check, str(ROOT / "CITATION.cff")], capture_output=True, text=True, check=False)

@@ -37,20 +37,6 @@ def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
     assert table["status"].tolist() == ["completed"]
 
 
-def test_a_folder_is_written_and_read(tmp_path):
-    table = servobench.compare([Resting], settings=SHORT, out=tmp_path / "out")
-    found = servobench.load(tmp_path / "out")
-    assert found.runs["run_id"].tolist() == table["run_id"].tolist()
-    assert found.steps is not None
-    assert len(found.steps) == 10
-    assert found.manifest["controllers"] == ["Resting"]
-
-
-def test_one_run_has_its_row_and_steps():
-    result = servobench.run(Resting, seed=3, settings=SHORT)
-    assert (result.row["controller"], result.row["seed"], len(result.steps)) == ("Resting", 3, 10)
-
-
 def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
     with pytest.raises(
         ValueError,

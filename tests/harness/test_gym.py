@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
-from kit.documents import blocks
 from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import RENDERED, default_plant
@@ -229,22 +227,4 @@ def test_version_0_still_gives_what_it_gave():
     rewards = [env.step(np.full(6, 0.1))[1] for _ in range(20)]
     assert ENVIRONMENT.endswith("-v0")
     np.testing.assert_allclose([rewards[0], sum(rewards)], [-0.028570258752639313, -0.5935999997431326], rtol=1e-9)
-    env.close()
-
-
-def test_the_policy_of_the_page_gives_the_same_run_as_a_controller_and_in_the_environment():
-    page = (Path(__file__).parents[2] / "docs" / "learning.md").read_text(encoding="utf-8")
-    episode, policy = blocks(page, "python")
-    spaces: dict[str, object] = {"__name__": "learned"}
-    exec(compile(episode, "learning.md", "exec"), spaces)
-    assert spaces["truncated"]
-    exec(compile(policy, "learning.md", "exec"), spaces)
-    kind = spaces["Learned"]
-    steps = run(kind, task="exp2", seed=2).steps
-    env = ServoEnv(task="exp2")
-    seen, _ = env.reset(seed=2)
-    weights = np.random.default_rng(0).normal(0.0, 0.05, (6, len(seen)))
-    for feature in steps.filter(regex="^feature_.*_m$").to_numpy()[:40]:
-        np.testing.assert_array_equal(env.observation.feature, feature)
-        seen, *_ = env.step(np.tanh(weights @ seen))
     env.close()

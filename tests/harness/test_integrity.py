@@ -351,38 +351,15 @@ def test_a_file_that_is_gone_is_named(whole, tmp_path, name):
     assert found == [(name, "is missing")]
 
 
-@pytest.mark.parametrize(
-    ("source", "name", "what"),
-    [(8, 12, "holds the rows of other runs"), (None, 12, "holds runs that the part before it has, too")],
-)
-def test_rows_that_are_not_those_of_their_part_are_named_where_nothing_vouches_for_them(
-    half, tmp_path, source, name, what
-):
+def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_them(half, tmp_path):
     folder = copy(half, tmp_path)
     (folder / SUMS).unlink()
-    place = folder / results.part_name(name, results.RUNS)
-    if source is None:
-        (folder / results.part_name(8, results.RUNS)).unlink()
-        rows = [made_up_row(f"run{index}") for index in range(6)]
-        tables.write_table(tables.as_table(rows), folder / results.part_name(8, results.RUNS))
-        tables.write_table(tables.as_table(rows), place)
-    else:
-        shutil.copy(folder / results.part_name(source, results.RUNS), place)
+    rows = tables.as_table([made_up_row(f"run{index}") for index in range(6)])
+    for index in (8, 12):
+        (folder / results.part_name(index, results.RUNS)).unlink(missing_ok=True)
+        tables.write_table(rows, folder / results.part_name(index, results.RUNS))
     named = {each.name: each.fault for each in examine(folder).findings}
-    assert named[results.part_name(name, results.RUNS)] == what
-
-
-def test_a_changed_bit_is_found_by_the_pages_where_nothing_vouches_for_a_table(half, tmp_path):
-    folder = copy(half, tmp_path)
-    (folder / SUMS).unlink()
-    place = folder / results.part_name(8, results.RUNS)
-    content = bytearray(place.read_bytes())
-    content[60] ^= 1  # within the first page
-    place.write_bytes(content)
-    named = {each.name: each.fault for each in examine(folder).findings}
-    said = named[results.part_name(8, results.RUNS)]
-    assert said.startswith("cannot be read (")
-    assert "CRC" in said  # the words of the library
+    assert named[results.part_name(12, results.RUNS)] == "holds runs that the part before it has, too"
 
 
 def test_a_changed_bit_is_found_by_the_pages_also_where_only_some_runs_are_read(tmp_path):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kit.nightly import some
 from kit.plants import NEEDS_BULLET
 from servobench.controllers.laws.mfac import MfacLaw
 from servobench.controllers.methods import METHODS
@@ -14,7 +15,6 @@ from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import FilterDiverged
 
 ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}
-PROBED = {"mfac+rls": {"initial": {"source": "probe", "settle_periods": 3, "average_periods": 1}}}
 
 
 def lossy(probability, periods):
@@ -38,7 +38,10 @@ def one_by_one(resolved):
     return rows(carry_out(run, steps=False) for run in resolved)
 
 
-@pytest.mark.parametrize("controller", [name for name in METHODS if METHODS[name].side_by_side])
+SIDE_BY_SIDE = [name for name in METHODS if METHODS[name].side_by_side]
+
+
+@pytest.mark.parametrize("controller", some(SIDE_BY_SIDE, "map_mfac", "ukf_mpc", "rbf_pid:published", "rls"))
 def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
     assert side_by_side_key(together[0]) is not None
@@ -55,11 +58,6 @@ def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():
     alone = one_by_one(together)
     assert len({row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}) == len(SEEDS)
     np.testing.assert_equal(rows(carry_out_together(together)), alone)
-
-
-def test_probing_runs_go_side_by_side():
-    together = runs("mfac+rls", {**ROUGH, **PROBED})
-    np.testing.assert_equal(rows(carry_out_together(together)), one_by_one(together))
 
 
 def test_runs_that_lose_the_feature_leave_the_others_alone():
@@ -91,11 +89,6 @@ def test_a_block_of_which_every_run_ends_early_has_all_its_rows():
     alone = one_by_one(together)
     assert {row["status"] for row in alone} == {"feature_lost"}
     np.testing.assert_equal(rows(carry_out_together(together)), alone)
-
-
-def test_times_of_runs_side_by_side_are_unknown():
-    row = carry_out_together(runs("ukf_mfac", ROUGH))[0].row
-    assert np.isnan([row[name] for name in row if "_time_" in name and "settling" not in name]).all()
 
 
 @NEEDS_BULLET

@@ -1,4 +1,4 @@
-"""What there is, listed for readers and for programs, and completed by the shell."""
+"""What there is, listed for readers and for programs, and completed by the shell, also behind colons."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from kit.command import servobench
 from servobench.harness.batch.results import load_runs
-from servobench.harness.cli.main import command_line
+from servobench.harness.cli.main import command_line, join_words
 from servobench.harness.config.description import plain
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import flatten
@@ -35,9 +35,8 @@ def test_lists_fit_into_80_columns_and_no_name_is_broken(monkeypatch, capsys, ki
 
 
 def test_all_names_and_summaries_are_there_as_json(monkeypatch, capsys):
-    assert [
-        each["name"] for each in json.loads(shown(monkeypatch, capsys, "controllers", "--json"))
-    ] == controller_names()
+    found = json.loads(shown(monkeypatch, capsys, "controllers", "--json"))
+    assert [each["name"] for each in found] == controller_names()
     listed = json.loads(shown(monkeypatch, capsys, "tasks", "--json"))
     assert listed == [{"name": name, "summary": entry.summary} for name, entry in TASKS.items()]
 
@@ -92,7 +91,23 @@ def test_the_shell_completes_names_also_within_lists(words, wanted):
     assert completed(*words) == wanted
 
 
+@pytest.mark.parametrize(
+    ("words", "joined", "before"),
+    [
+        (["servobench", "run", "ukf"], ["servobench", "run", "ukf"], ""),
+        (["servobench", "run", "ukf_mfac", ":", "pub"], ["servobench", "run", "ukf_mfac:pub"], "ukf_mfac:"),
+        (["servobench", "run", "ukf_mfac", ":"], ["servobench", "run", "ukf_mfac:"], "ukf_mfac:"),
+        (["servobench", "run", "--plant", "=", "kin"], ["servobench", "run", "--plant=kin"], "--plant="),
+        (["servobench", "run", "a", "=", "./b.py", ":", "M"], ["servobench", "run", "a=./b.py:M"], "a=./b.py:"),
+        (["servobench", "run", "a", ":", "b", ""], ["servobench", "run", "a:b", ""], ""),
+    ],
+)
+def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_were_typed(words, joined, before):
+    assert join_words([*words, "after"], len(words) - 1) == (joined, before)
+
+
 def test_a_run_takes_its_controller_first(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
     short = ("--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out"))
     assert servobench(monkeypatch, "run", "constant", *short) == 0
     assert load_runs(tmp_path / "out")["run_id"].tolist() == ["kinematic-constant-exp2-moderate-0"]

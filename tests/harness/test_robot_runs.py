@@ -64,12 +64,6 @@ def test_a_task_is_as_far_away_as_the_arm_is_long(task):
         assert getattr(own, name, None) == getattr(entry.default, name, None)
 
 
-def test_the_endless_circle_is_as_large_as_the_short_one():
-    requests = [replace(PANDA, task=task, mismatch="none") for task in ("circle", "endurance")]
-    circle, endurance = (build_experiment(each, Settings()).scenario.reference for each in requests)
-    np.testing.assert_allclose(circle.at(1.0), endurance.at(1.0))
-
-
 def test_a_taught_random_move_is_free_of_contact():
     work = find_robot("panda").workspace
     for seed in range(5):

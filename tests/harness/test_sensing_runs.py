@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 import servobench
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
-from servobench.controllers.units import in_natural_units
 from servobench.harness.batch.manifest import describe_sensing, named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import find_plant
@@ -76,14 +75,6 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
         jacobians = [controller.estimated_jacobian() for controller in pair]
         np.testing.assert_allclose(jacobians[1], 1000.0 * jacobians[0], rtol=1e-6, atol=1e-6)
         seen = plant.step(commands[0])
-
-
-def test_natural_units_of_metres_are_the_same_knowledge():
-    knowledge = build_experiment(request("position"), Settings({})).controller.servo.knowledge
-    assert in_natural_units(knowledge) is knowledge
-    pixels = build_experiment(request("pixel"), Settings({})).controller.servo.knowledge
-    assert pixels.spec.feature.scale == 1.0
-    assert pixels.unit == pytest.approx(207.85 / 1.3, rel=1e-3)
 
 
 def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the_planned_image():
@@ -175,11 +166,6 @@ def test_the_canonical_tasks_displace_the_target_before_the_camera_as_they_say(w
         np.testing.assert_allclose(away.mean(axis=0)[2], 0.75 * home.mean(axis=0)[2], rtol=1e-5)
 
 
-def test_a_canonical_task_needs_a_target_with_a_pose():
-    with pytest.raises(ConfigurationError, match="task axis_turn: it needs a target with a pose; use --sensing plate"):
-        build_experiment(request("pixel", "axis_turn"), Settings({}))
-
-
 def test_a_pose_is_reached_or_not_by_the_length_of_the_arm():
     robot = find_robot("ur5")
     rng, limit = np.random.default_rng(0), np.full(6, 2 * np.pi)
@@ -261,13 +247,6 @@ def test_a_plant_may_have_the_position_only(monkeypatch):
     monkeypatch.setattr(experiment, "find_plant", lambda _: entry)
     with pytest.raises(ConfigurationError, match="plant kinematic has the sensing position only, got --sensing pixel"):
         build(resolve(request("pixel"), Settings({})))
-
-
-def test_a_plate_is_refused_for_an_arm_of_four_joints(tmp_path):
-    file = tmp_path / "four.toml"
-    file.write_text(FOUR_JOINTS)
-    with pytest.raises(ConfigurationError, match="sensing plate needs an arm of 6 joints or more"):
-        build_experiment(request("plate", robot=str(file)), Settings({}))
 
 
 def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):

@@ -59,6 +59,7 @@ def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(tmp_path
     assert command(monkeypatch, "tasks", "./spiral.py") == 0
     assert "Spiral.radius = 0.1" in capsys.readouterr().out
     options = ("--plants", "kinematic", "--controllers", "constant", "--tasks", "round=./spiral.py", "--out", "runs")
+    options += ("--workers", "1", "--no-report")
     assert command(monkeypatch, "compare", *options, "--set", "round.radius=0.2") == 0
     assert servobench.load("runs").runs["task"].unique().tolist() == ["round"]
 

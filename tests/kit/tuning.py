@@ -9,8 +9,9 @@ import numpy as np
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.config.settings import flatten
 from servobench.harness.studies.tuning import scoring
-from servobench.harness.studies.tuning.campaign import StudyRecord, TunedValues, TuningPlan, advance, open_methods
+from servobench.harness.studies.tuning.campaign import TunedValues, TuningPlan, advance, open_methods
 from servobench.harness.studies.tuning.objective import TuningSet
+from servobench.harness.studies.tuning.search import StudyRecord
 
 SMALL = TuningSet(robots=2)
 
@@ -22,6 +23,7 @@ def plan_of(*names, trials=1, studies=1, search=0, **further):
 
 def carried_out(folder, plan, workers=1):
     """Carry a plan out and return its methods."""
+    folder.mkdir(parents=True, exist_ok=True)
     methods = open_methods(folder, plan)
     with open_workers(workers) as place:
         for _ in advance(methods, plan, place):

@@ -28,6 +28,10 @@ def test_the_engine_can_be_imported_without_a_standard_error():
     assert python(program, stdout=subprocess.PIPE).stdout == "2\n"
 
 
+def test_naming_the_rendered_plants_loads_no_engine():
+    python("import sys, servobench.plant.rendered.plants; sys.exit(bool({'pybullet', 'mujoco'} & set(sys.modules)))")
+
+
 def fail_to_import(descriptor):
     with without_banner(descriptor):
         os.write(descriptor, b"reason\n")

@@ -75,11 +75,6 @@ def test_the_true_jacobian_predicts_the_true_feature(plant):
     np.testing.assert_allclose(after.feature - before.feature, J @ moved, atol=2e-5)
 
 
-def test_a_command_that_is_not_finite_cannot_be_made():
-    with pytest.raises(ValueError, match="joint_velocity must be finite"):
-        Command(np.array([0.0, np.nan]))
-
-
 def test_a_start_of_the_wrong_size_is_refused(entry):
     with pytest.raises(ValueError, match="start must have shape"):
         entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))

@@ -11,9 +11,8 @@ are those of the coordinate search: each other value of each switch, and 20 % mo
 
 from __future__ import annotations
 
-import json
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any, Final, final
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import default_config, file_stem
+from servobench.harness.config.description import toml
 from servobench.harness.studies.tuning.objective import TuningSet, score
 from servobench.harness.studies.tuning.scoring import (
     LEDGER,
@@ -32,7 +32,7 @@ from servobench.harness.studies.tuning.scoring import (
     open_ledger,
     refuse_broken_defaults,
 )
-from servobench.harness.studies.tuning.search import StudyOutcome, first_points, neighbours, study
+from servobench.harness.studies.tuning.search import StudyRecord, first_points, neighbours, study
 from servobench.harness.studies.tuning.spaces import (
     Point,
     default_values,
@@ -77,25 +77,24 @@ class RunningStudy:
     """A study and where it stands.
 
     Attributes:
-        seed: of its sampler.
-        wanted: the point that it asks for; None once it has ended.
+        wanted: the nested settings that it asks for; None once it has ended.
         asked: number of points that it was given the scores of.
         outcome: its result, once it has ended.
     """
 
-    def __init__(self, seed: int, course: Generator[Point, float, StudyOutcome]) -> None:
+    def __init__(self, course: Generator[Point, float, StudyRecord]) -> None:
         """Ask for the first point."""
-        self.seed, self.asked = seed, 0
-        self.outcome: StudyOutcome | None = None
+        self.asked = 0
+        self.outcome: StudyRecord | None = None
         self._course = course
-        self.wanted: Point | None = next(course)
+        self.wanted: Mapping[str, Any] | None = nested_settings(next(course))
 
     def advance(self, ledger: Ledger) -> None:
         """Go on up to a point that the ledger does not know, or to the end."""
-        while self.wanted is not None and (costs := ledger.costs(nested_settings(self.wanted))) is not None:
+        while self.wanted is not None and (costs := ledger.costs(self.wanted)) is not None:
             try:
                 self.asked += 1
-                self.wanted = self._course.send(score(costs))
+                self.wanted = nested_settings(self._course.send(score(costs)))
             except StopIteration as end:
                 self.wanted, self.outcome = None, end.value
 
@@ -105,23 +104,18 @@ class Method:
     """A controller with its studies and the ledgers of both sets."""
 
     def __init__(self, folder: Path, name: str, plan: TuningPlan) -> None:
-        """Open its ledgers.
+        """Open its ledgers and begin its studies.
 
         Raises:
             ConfigurationError: a file of the folder is no ledger, or one of other settings or runs.
         """
-        self.name, self._plan, second = name, plan, plan.runs.second()
+        self.name, self._plan = name, plan
         self.ledger = open_ledger(folder, name, plan.runs)
-        self.second = open_ledger(folder, name, second, SECOND)
-        self.studies: list[RunningStudy] = []
-
-    def begin(self) -> None:
-        """Begin its studies."""
-        plan, space, first = self._plan, find_space(self.name), first_points(self.name)
+        self.second = open_ledger(folder, name, plan.runs.second(), SECOND)
+        self._default = nested_settings(default_values(find_tunable(name)))
+        space, first = find_space(name), first_points(name)
         seeds = range(plan.study_seed, plan.study_seed + plan.studies)
-        self.studies = [
-            RunningStudy(seed, study(self.name, space, first, plan.trials, plan.search, seed)) for seed in seeds
-        ]
+        self.studies = [RunningStudy(study(name, space, first, plan.trials, plan.search, seed)) for seed in seeds]
 
     @property
     def done(self) -> int:
@@ -129,20 +123,32 @@ class Method:
         whole = self._plan.trials + self._plan.search
         return sum(each.asked if each.outcome is None else whole for each in self.studies)
 
-    def chosen(self) -> list[Point]:
+    def wanted(self) -> list[Wanted]:
+        """Return the points that its studies ask for, after they went on as far as the ledger knows."""
+        for each in self.studies:
+            each.advance(self.ledger)
+        return [(self.ledger, self.name, each.wanted) for each in self.studies if each.wanted is not None]
+
+    def wanted_on_second(self) -> list[Wanted]:
         """Return the points to score on the second set: the defaults and the results of the studies; none before."""
-        found = [each.outcome.found.values for each in self.studies if each.outcome is not None]
-        return [default_values(find_tunable(self.name)), *found] if len(found) == len(self.studies) else []
+        outcomes = [each.outcome for each in self.studies if each.outcome is not None]
+        points = [self._default, *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
+        return [(self.second, self.name, point) for point in points]
 
     def result(self) -> TunedValues | None:
         """Return the tuned values; None while a study is not finished or not scored on the second set."""
-        records = [record for each in self.studies if (record := self._record(each)) is not None]
+        outcomes = [each.outcome for each in self.studies if each.outcome is not None]
+        seconds = [self.second.costs(each.settings) for each in outcomes]
+        records = [
+            replace(outcome, second_score=score(costs))
+            for outcome, costs in zip(outcomes, seconds, strict=True)
+            if costs is not None
+        ]
         if len(records) < len(self.studies):
             return None
         best, runs = min(records, key=lambda record: record.second_score), self._plan.runs
-        default = nested_settings(default_values(find_tunable(self.name)))
-        mine, theirs = self.ledger.costs(best.settings), self.ledger.costs(default)
-        on_second = self.second.costs(default)
+        mine, theirs = self.ledger.costs(best.settings), self.ledger.costs(self._default)
+        on_second = self.second.costs(self._default)
         if mine is None or theirs is None or on_second is None:
             return None
         checked = runs.checked()
@@ -165,25 +171,6 @@ class Method:
             studies=tuple(records),
         )
 
-    def _record(self, running: RunningStudy) -> StudyRecord | None:
-        if running.outcome is None:
-            return None
-        outcome, chosen = running.outcome, nested_settings(running.outcome.found.values)
-        second = self.second.costs(chosen)
-        if second is None:
-            return None
-        return StudyRecord(
-            seed=running.seed,
-            trials=outcome.trials,
-            best_trial=outcome.best_trial,
-            best_trial_score=outcome.best_trial_score,
-            search_points=outcome.found.evaluations,
-            search_complete=outcome.found.complete,
-            score=outcome.found.score,
-            second_score=score(second),
-            settings=chosen,
-        )
-
 
 def check_study_folder(folder: Path) -> None:
     """Refuse a folder with other things than studies in it.
@@ -200,27 +187,12 @@ def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
     """Open the ledgers of a plan's methods and begin their studies.
 
     Raises:
-        ConfigurationError: the folder has other things in it or cannot be made, or a ledger of it is another one.
+        ConfigurationError: a ledger of the folder is another one, or a method cannot be built.
     """
-    check_study_folder(folder)
-    make_folder(folder)
     methods = [Method(folder, name, plan) for name in plan.controllers]
     for method in methods:
         refuse_broken_defaults(method.name, plan.runs)
-        method.begin()
     return methods
-
-
-def make_folder(folder: Path) -> None:
-    """Make the folder of studies.
-
-    Raises:
-        ConfigurationError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"study folder {folder} cannot be made: {error.strerror}") from error
 
 
 def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> Iterator[Method]:
@@ -232,23 +204,13 @@ def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> It
     by_name = {method.name: method for method in methods}
     under_way = True
     while under_way:
-        wanted = _wanted(methods)
+        wanted = [point for method in methods for point in method.wanted()]
         under_way = bool(wanted)
         yield from methods
-        chosen = [(method.second, method.name, point) for method in methods for point in method.chosen()]
+        chosen = [point for method in methods for point in method.wanted_on_second()]
         for points, runs in ((wanted, plan.runs), (chosen, plan.runs.second())):
             for name in fill(points, runs, workers):
                 yield by_name[name]
-
-
-def _wanted(methods: Sequence[Method]) -> list[Wanted]:
-    wanted: list[Wanted] = []
-    for method in methods:
-        for each in method.studies:
-            each.advance(method.ledger)
-            if each.wanted is not None:
-                wanted.append((method.ledger, method.name, each.wanted))
-    return wanted
 
 
 def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
@@ -257,21 +219,6 @@ def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, Tuned
     for name, tuned in results.items():
         write_tuned(folder / f"{file_stem(name)}.toml", tuned)
     return results
-
-
-@dataclass(frozen=True)
-class StudyRecord:
-    """One of the studies of a method."""
-
-    seed: int  # of the sampler
-    trials: int  # of the sampler, known settings included
-    best_trial: int  # the number of the best one; 0 is that of the defaults
-    best_trial_score: float
-    search_points: int  # scored by the coordinate search that began there
-    search_complete: bool  # whether no change of one value improves the score; False: its budget ended first
-    score: float  # at its end
-    second_score: float  # of the same settings on the second set
-    settings: Mapping[str, Any]  # nested values
 
 
 @dataclass(frozen=True)
@@ -302,30 +249,19 @@ class TunedValues:
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:
     """Write the file atomically."""
-    tables = ("settings", "studies")
-    header = {item.name: getattr(tuned, item.name) for item in fields(tuned) if item.name not in tables}
-    if not tuned.studies:
-        header["studies"] = ()
-    text = HEADING + _table("", header)
-    text += _table("settings", tuned.settings)
-    for record in tuned.studies:
-        values = {item.name: getattr(record, item.name) for item in fields(record)}
-        text += "\n[[studies]]\n" + _table("", {key: value for key, value in values.items() if key != "settings"})
-        text += _table("studies.settings", record.settings)
+    values = asdict(tuned)
+    records = values.pop("studies")
+    text = HEADING + _table(values if records else {**values, "studies": ()})
+    text += "".join(_table(record, "studies.", "\n[[studies]]\n") for record in records)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
-def _table(name: str, values: Mapping[str, Any]) -> str:
-    plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
+def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
+    """Return a table in TOML, those in it after its own values; `before` stands before their names."""
     nested = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    heading = f"\n[{name}]\n" if name and (plain or not nested) else ""
-    lines = "".join(f"{key} = {_value(value)}\n" for key, value in plain.items())
-    return heading + lines + "".join(_table(f"{name}.{key}", value) for key, value in nested.items())
-
-
-def _value(value: object) -> str:
-    """Return a number, a switch, a text or a list of these as TOML; JSON writes them in the same way."""
-    return json.dumps(list(value) if isinstance(value, tuple) else value)
+    lines = "".join(f"{key} = {toml(value)}\n" for key, value in values.items() if key not in nested)
+    tables = (_table(value, f"{before}{key}.", f"\n[{before}{key}]\n") for key, value in nested.items())
+    return heading * bool(lines or not nested) + lines + "".join(tables)
 
 
 @dataclass(frozen=True)
@@ -348,50 +284,42 @@ class Change:
 class Check:
     """The settings in use of some methods with all their changes, on one set of runs."""
 
-    def __init__(self, folder: Path, controllers: Sequence[str], runs: TuningSet, keys: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, controllers: Sequence[str], runs: TuningSet) -> None:
         """Open the ledgers, in which a check goes on where it stopped.
 
         Args:
-            folder: of the ledgers; made if needed.
+            folder: of the ledgers.
             controllers: names of methods with a search space.
             runs: the runs on which changes are judged.
-            keys: the keys that are changed; none for all.
 
         Raises:
             ConfigurationError: a name or a file that cannot be used.
         """
-        make_folder(folder)
         self._runs = runs
         self._changes: list[tuple[Ledger, str, str, Point, Point]] = []
+        points: dict[str, Wanted] = {}
         for name in controllers:
             refuse_broken_defaults(name, runs)
             ledger = open_ledger(folder, name, runs, SECOND)
             space, values = find_space(name), values_of(name, default_config(find_tunable(name)))
-            self._changes += [
-                (ledger, name, key, values, other)
-                for key, other in neighbours(space, values)
-                if (not keys or key in keys) and nested_settings(other) != nested_settings(values)
-            ]
+            for key, other in neighbours(space, values):
+                before, after = nested_settings(values), nested_settings(other)
+                if after != before:
+                    self._changes.append((ledger, name, key, values, other))
+                    points |= {f"{name}{each}": (ledger, name, each) for each in (before, after)}
+        self._points = list(points.values())
 
     def __len__(self) -> int:
         """Return the number of points to score, those known already included."""
-        return len(self._scored())
+        return len(self._points)
 
     def known(self) -> int:
         """Return how many of the points the ledgers know."""
-        return sum(self._scored().values())
-
-    def _scored(self) -> dict[str, bool]:
-        """Return whether a point is known, for each."""
-        points = [(ledger, name, nested_settings(point)) for ledger, name, point in self._points()]
-        return {f"{name}{nested}": ledger.costs(nested) is not None for ledger, name, nested in points}
-
-    def _points(self) -> list[Wanted]:
-        return [(ledger, name, point) for ledger, name, _, *points in self._changes for point in points]
+        return sum(ledger.costs(point) is not None for ledger, _, point in self._points)
 
     def carry_out(self, workers: Workers) -> Iterator[str]:
         """Score the points that the ledgers lack, and yield the controller of each point."""
-        yield from fill(self._points(), self._runs, workers)
+        yield from fill(self._points, self._runs, workers)
 
     def changes(self) -> list[Change]:
         """Return every change whose scores are known."""

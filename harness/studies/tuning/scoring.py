@@ -8,10 +8,8 @@ that scores depend on besides the settings, each other one the settings of a poi
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -27,12 +25,12 @@ from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
-from servobench.harness.studies.tuning.spaces import Point, find_tunable, nested_settings
+from servobench.harness.studies.tuning.spaces import find_tunable
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 SECOND: Final = ".second"  # of the name of the ledger of the second set
-Wanted: TypeAlias = tuple["Ledger", str, Point]
-"""A point whose costs a ledger lacks: the ledger, the controller, the point."""
+Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
+"""A point whose costs are wanted: the ledger that takes them, the controller, its nested settings."""
 LEDGER: Final = ".jsonl"
 SHOWN: Final = 60  # letters of wrong costs that a message holds
 
@@ -54,13 +52,15 @@ class Ledger:
         self.path = path
         self._fingerprint = dict(fingerprint)
         self._costs: dict[str, list[float]] = {}
+        self._size = 0  # [bytes] of its whole lines: a process that is killed or interrupted may leave half a line
         if path.is_file():
             self._read()
 
     def _read(self) -> None:
         try:
-            whole, _, _ = self.path.read_bytes().rpartition(b"\n")  # a killed process may leave half a line
-            header, *records = [json.loads(line) for line in whole.splitlines()] or [self._fingerprint]
+            content = self.path.read_bytes()
+            self._size = content.rfind(b"\n") + 1
+            header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ConfigurationError(f"study {self.path} cannot be opened: {error}") from error
@@ -85,16 +85,14 @@ class Ledger:
 
     def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
         """Write the costs of the runs under nested settings down."""
-        record = json.dumps({"settings": settings, "costs": list(costs)}) + "\n"
+        lines = [self._fingerprint] * (not self._size) + [{"settings": settings, "costs": list(costs)}]
         try:
-            present = self.path.read_bytes() if self.path.is_file() else b""
-            whole = present.rfind(b"\n") + 1
-            with self.path.open("r+b" if present else "wb") as file:
-                file.truncate(whole)
-                file.seek(whole)
-                file.write((record if whole else json.dumps(self._fingerprint) + "\n" + record).encode())
+            with self.path.open("ab") as file:
+                file.truncate(self._size)
+                file.write("".join(f"{json.dumps(line)}\n" for line in lines).encode())
                 file.flush()
                 os.fsync(file.fileno())
+                self._size = file.tell()
         except OSError as error:
             raise ConfigurationError(f"study {self.path} cannot be written: {error.strerror}") from error
         self._costs[_key(settings)] = list(costs)
@@ -153,9 +151,8 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
     Settings that cannot be built or whose loop bears no delay have the worst cost in every run, without a run.
     """
     requests = runs.runs()
-    lacking: dict[str, tuple[Ledger, Trial, dict[str, Any]]] = {}
-    for ledger, name, point in wanted:
-        nested = nested_settings(point)
+    lacking: dict[str, tuple[Ledger, Trial, Mapping[str, Any]]] = {}
+    for ledger, name, nested in wanted:
         if ledger.costs(nested) is not None or f"{name}{nested}" in lacking:
             continue
         try:
@@ -174,8 +171,7 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
         costs[point_index, run_index] = cost
         if not np.isnan(costs[point_index]).any():
             ledger, trial, nested = points[point_index]
-            with undisturbed():
-                ledger.add(nested, costs[point_index].tolist())
+            ledger.add(nested, costs[point_index].tolist())
             yield trial.controller
 
 
@@ -203,16 +199,3 @@ def bears_delay(trial: Trial) -> bool:
         return delay_margin(trial.config, trial.controller) >= objective.MIN_DELAY_MARGIN
     except (ArithmeticError, ValueError, RunFault):  # it fails in the runs, too, whose cost says so
         return True
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Hold Ctrl-C back until the end, so that it cannot interrupt a ledger that is written."""
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt

@@ -7,10 +7,11 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import optuna
@@ -20,6 +21,7 @@ from optuna.samplers import TPESampler
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.defaults import apply_settings, tuned_settings
+from servobench.harness.config.settings import flatten
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     Distribution,
@@ -40,8 +42,7 @@ STEP_FROM_ZERO: Final = 0.05  # [1] share of the range's upper end by which a nu
 ACCEPTED: Final = 0.005  # [1] share of the score that a change must gain to be kept
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Where a coordinate search ended."""
 
     values: Point
@@ -51,18 +52,23 @@ class Found:
 
 
 @dataclass(frozen=True)
-class StudyOutcome:
-    """The result of a study."""
+class StudyRecord:
+    """The result of a study, as files of tuned values hold it."""
 
-    trials: int  # trials of the sampler, the first points included
-    best_trial: int  # number of the best one, from 0; the first is that of the defaults
+    seed: int  # of the sampler
+    trials: int  # of the sampler, the first points included
+    best_trial: int  # the number of the best one; 0 is that of the defaults
     best_trial_score: float
-    found: Found  # where the coordinate search went from there
+    search_points: int  # scored by the coordinate search that began there
+    search_complete: bool  # whether no change of one value improves the score; False: its budget ended first
+    score: float  # at its end
+    second_score: float  # of the same settings on the second set; NaN until they are scored there
+    settings: Mapping[str, Any]  # nested values
 
 
 def study(
     name: str, space: Space, first: Sequence[Point], trials: int, search: int, seed: int
-) -> Generator[Point, float, StudyOutcome]:
+) -> Generator[Point, float, StudyRecord]:
     """Search for the best point of a space.
 
     Args:
@@ -87,7 +93,8 @@ def study(
         sampled.tell(trial, score)
     best = min(range(trials), key=lambda number: tried[number][0])
     found = yield from coordinate_search(space, tried[best][1], tried[best][0], search)
-    return StudyOutcome(trials, best, tried[best][0], found)
+    search_end = (found.evaluations, found.complete, found.score, math.nan, nested_settings(found.values))
+    return StudyRecord(seed, trials, best, tried[best][0], *search_end)
 
 
 def _sampler(seed: int) -> TPESampler:
@@ -180,17 +187,9 @@ def _borrowed(name: str, own: Point) -> Iterator[Point]:
     space = find_space(name)
     for other in SPACES:
         settings = {} if other == name else tuned_settings(other)
-        shared = {key: value for key, value in _flat(settings) if key in space}
+        shared = {key: value for key, value in flatten(settings).items() if key in space}
         if shared:
             yield inside(space, {**own, **shared}, own)
-
-
-def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - nested tables
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
 
 
 def inside(space: Space, values: Point, otherwise: Point) -> Point:

@@ -24,7 +24,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from servobench.controllers.aids import RANGES, SWITCHES
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import flatten, nest
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
@@ -176,11 +176,5 @@ def values_of(name: str, config: Any) -> Point:  # noqa: ANN401 - any configurat
 
 def nested_settings(values: Point) -> dict[str, Any]:
     """Return the nested settings of a point of a search space, numbers rounded to three digits."""
-    nested: dict[str, Any] = {}
-    for key, value in values.items():
-        *path, last = key.split(".")
-        target = nested
-        for word in path:
-            target = target.setdefault(word, {})
-        target[last] = float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
-    return nested
+    rounded = {key: float(f"{each:.{DIGITS}g}") if isinstance(each, float) else each for key, each in values.items()}
+    return nest(rounded)
