@@ -60,13 +60,14 @@ class Ending:
         error = _behind(error)
         place = _place(error)
         where = f" ({place})" if place else ""
-        trace = _trace(error) if place else ""
         if isinstance(error, RunFault):
-            return cls(error.status, f"{_one_line(error)}{where}", trace)
-        if isinstance(error, FloatingPointError):
-            return cls(NUMERICAL_ERROR, f"{_one_line(error)}{where}", trace)
-        status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        return cls(status, f"{describe_error(error)}{where}", trace)
+            status, reason = error.status, _one_line(error)
+        elif isinstance(error, FloatingPointError):
+            status, reason = NUMERICAL_ERROR, _one_line(error)
+        else:
+            status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+            reason = f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
+        return cls(status, f"{reason}{where}", _trace(error) if place else "")
 
 
 @dataclass(frozen=True)
@@ -90,11 +91,6 @@ class RunResult:
         """Return the result of a run of which only the columns of its request and its ending are known."""
         known = {"status": ending.status, "outcome": ending.status, "periods": 0, "reason": ending.reason}
         return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
-
-
-def describe_error(error: BaseException) -> str:
-    """Return the kind and the message of an error as one line."""
-    return f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
 
 
 def is_defect(error: BaseException) -> bool:
