@@ -63,14 +63,11 @@ class Export:
     def arm(self, fmi: int) -> Product:
         """Return the arm, with the mismatch as start values."""
         from servobench.fmus.export import ExportOptions, default_actuation, product
-        from servobench.harness.config.robots import find_robot, find_sensing
-        from servobench.plant.contract.seeds import named_seed
-        from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+        from servobench.harness.config.robots import find_robot
+        from servobench.harness.config.settings import Settings
+        from servobench.harness.run.experiment import draw_robot
 
-        described, differs = find_robot(self.robot), Mismatch.parse(self.mismatch)
-        drawn = named_seed(self.seed, "mismatch")
-        arm, sample = sample_mismatch(differs, described, drawn)
-        model, _ = find_sensing(self.sensing).true(described, arm, sample, differs, drawn)
+        described, (model, *_) = find_robot(self.robot), draw_robot(self.request("constant", Settings()))
         words = "none" if self.mismatch == "none" else f"{self.mismatch}, seed {self.seed}"
         return product(ExportOptions(fmi, model, default_actuation(described), mismatch=words, robot=described))
 
