@@ -12,7 +12,7 @@ import typer
 
 from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options
-from servobench.harness.cli.options import CONTROLLER, command, option
+from servobench.harness.cli.options import CONTROLLER, command, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -33,14 +33,10 @@ class Export:
     mismatch: options.MismatchOption = "none"
     robot: options.RobotOption = "ur5"
     sensing: options.SensingOption = "position"
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the run whose robot this is.")] = 0
+    seed: Annotated[int, option("INTEGER", "Seed of the run whose robot this is.")] = 0
     platforms: Annotated[
         str | None,
-        option(
-            "--platforms",
-            "NAMES",
-            "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine.",
-        ),
+        option("NAMES", "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
     ] = None
 
     @contextlib.contextmanager
@@ -76,17 +72,16 @@ class Export:
 @command
 def export(
     *,
-    output: Annotated[Path, option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
+    output: Annotated[Path, named_option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
     fmi: Annotated[
         int,
         option(
-            "--fmi",
             "INTEGER",
             "Version of FMI, 2 or 3. An arm has co-simulation and model exchange, a controller co-simulation.",
         ),
     ] = 2,
     controller: Annotated[
-        str | None, option("--controller", CONTROLLER, "Name or file of a controller to export instead of the arm.")
+        str | None, option(CONTROLLER, "Name or file of a controller to export instead of the arm.")
     ] = None,
     exported: Export,
     overrides: options.Overrides,
@@ -113,8 +108,8 @@ def export(
 @command
 def ssp(
     *,
-    output: Annotated[Path, option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
-    controller: Annotated[str, option("--controller", CONTROLLER, "Name or file of the controller.")],
+    output: Annotated[Path, named_option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
+    controller: Annotated[str, option(CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,
 ) -> None:
