@@ -123,7 +123,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     elif not is_unused(folder):
         check_resumable(folder)
     runs = survey(Grid(_request, campaign.cells))
-    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
+    own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
@@ -183,14 +183,13 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
         ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
     refuse_tuning_seeds(chain.from_iterable(runs.seeds))
-    check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
+    check_settings(campaign.settings, runs.sections)
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
-    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
-            build_block(Block((job,), own), place, observer.training)
+            build_block(Block((job,), offered(runs.sections)), place, observer.training)
         else:
             build_once(job.run, observer.training)
     return sections

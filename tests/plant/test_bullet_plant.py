@@ -5,7 +5,7 @@ import pytest
 
 from kit.plants import NEEDS_BULLET, configure, nominal_ur5
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.rendered.plants import build_bullet
+from servobench.plant.rendered.plants import BULLET
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
@@ -29,7 +29,7 @@ def test_the_camera_sees_the_circle_of_the_workspace_with_a_margin(height):
 @NEEDS_BULLET
 def test_a_period_that_physics_does_not_divide_is_refused():
     with pytest.raises(ValueError, match=r"period must be a whole multiple of the plant's own step of 0\.001 s"):
-        build_bullet(configure(RenderedConfig, scenery=False, latency=0.0), PlantSetup(MODEL, HOME, 0.0305))
+        BULLET.build(configure(RenderedConfig, scenery=False, latency=0.0), PlantSetup(MODEL, HOME, 0.0305))
 
 
 @NEEDS_BULLET
@@ -37,7 +37,7 @@ def test_a_gear_ratio_of_zero_is_refused():
     arm = MODEL.arm
     stuck = SerialArm(arm.joint_names, arm.translation, arm.rpy, arm.joint_offset, np.eye(6)[0], arm.tool)
     with pytest.raises(ValueError, match="gear_ratio must not be zero"):
-        build_bullet(BARE, PlantSetup(HandEyeModel(stuck, MODEL.X_BC), HOME, 0.05))
+        BULLET.build(BARE, PlantSetup(HandEyeModel(stuck, MODEL.X_BC), HOME, 0.05))
 
 
 def test_an_obstacle_that_is_no_box_is_refused():

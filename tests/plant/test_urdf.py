@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from kit.plants import factory_ur5
-from servobench.plant.rendered.urdf import arm_mechanics, arm_urdf, bench_files, rectangles_obj, rpy_along, sphere_obj
+from servobench.plant.rendered.urdf import (
+    arm_mechanics,
+    arm_tree,
+    bench_files,
+    rectangles_obj,
+    rpy_along,
+    sphere_obj,
+    text,
+)
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot
@@ -42,7 +50,7 @@ def arm(request) -> SerialArm:
 @pytest.fixture
 def loaded(arm, tmp_path):
     """The arm in PyBullet: a function from reported joint positions to the state of a link."""
-    (tmp_path / "arm.urdf").write_text(arm_urdf(arm, UR5), encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(text(arm_tree(arm, UR5)), encoding="utf-8")
     (tmp_path / "ball.obj").write_text(sphere_obj(0), encoding="utf-8")
     client = pybullet.connect(pybullet.DIRECT)
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -100,7 +108,7 @@ def test_masses_and_inertias_arrive_in_the_simulator(loaded):
 
 def test_numbers_in_the_urdf_lose_no_digit():
     arm = perturbed_ur5()
-    origins = ET.fromstring(arm_urdf(arm, UR5)).findall("joint/origin")
+    origins = arm_tree(arm, UR5).findall("joint/origin")
     written = np.array([[float(part) for part in origin.get("xyz").split()] for origin in origins])
     np.testing.assert_array_equal(written, np.vstack([arm.translation, arm.tool]))
 
@@ -117,14 +125,14 @@ def shapes(urdf, kind) -> list[tuple[str, str, str]]:
 
 
 def test_what_is_drawn_is_what_collides(arm):
-    drawn, solid = arm_urdf(arm, UR5), arm_mechanics(arm, 1.0, robot=UR5, shapes=True)
+    drawn, solid = text(arm_tree(arm, UR5)), arm_mechanics(arm, 1.0, robot=UR5, shapes=True)
     assert shapes(drawn, "visual") == shapes(solid, "collision")
     assert shapes(drawn, "collision") == shapes(solid, "visual") == []
     assert shapes(arm_mechanics(arm, 1.0, robot=UR5, shapes=False), "collision") == []
 
 
 def test_nothing_but_the_ball_is_reddish():
-    robot = ET.fromstring(arm_urdf(ur5.ur5_arm(), UR5))
+    robot = arm_tree(ur5.ur5_arm(), UR5)
     bench = ET.fromstring(bench_files()["bench.urdf"])
     for visual in [*robot.iter("visual"), *bench.iter("visual")]:
         red, green, blue, _ = (float(part) for part in visual.find("material/color").get("rgba").split())
@@ -176,4 +184,4 @@ def test_rectangles_face_up_and_have_their_area():
 def test_an_arm_with_another_number_of_joints_is_refused():
     arm = SerialArm(("one",), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.array([0.0, 0.0, 0.1]))
     with pytest.raises(ValueError, match="arm must have 6 joints like the UR5, got 1"):
-        arm_urdf(arm, UR5)
+        arm_tree(arm, UR5)
