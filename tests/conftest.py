@@ -79,6 +79,12 @@ def _floating_point_errors_raise():
 
 
 @pytest.fixture
+def no_figures(monkeypatch):
+    """Let commands draw no figures, which takes seconds."""
+    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+
+
+@pytest.fixture
 def own_folder(tmp_path, monkeypatch):
     """Give a test a folder, a path of imports and offers of its own."""
     from servobench.harness.config.registry import offering

@@ -54,7 +54,7 @@ def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_fil
     assert "spiral.py" in " ".join(manifest["files"])
 
 
-def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(tmp_path, monkeypatch, capsys):
+def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(no_figures, tmp_path, monkeypatch, capsys):
     write(tmp_path, SPIRAL, "spiral.py")
     assert command(monkeypatch, "tasks", "./spiral.py") == 0
     assert "Spiral.radius = 0.1" in capsys.readouterr().out
