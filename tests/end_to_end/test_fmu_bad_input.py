@@ -10,9 +10,6 @@ import pytest
 
 from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe_with, mapping
-from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.request import RunRequest
 
 FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
@@ -100,20 +97,3 @@ def test_an_fmu_that_does_not_fit_is_one_line(
     assert message in line
     assert code == 2
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("version", "quirk", "message"),
-    [
-        (2, 1, "fmi2DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
-        (3, 7, "crane.fmu returned something that is not finite for place[2]"),
-    ],
-)
-def test_a_failure_during_the_run_is_its_status_and_reason(version, quirk, message, tmp_path, temporary):
-    build_crane(tmp_path / "crane.fmu", version)
-    (tmp_path / "crane.toml").write_text(f"{mapping(version)}[parameters]\nquirk = {quirk}\n")
-    settings = Settings({"target": {"target": [0.2, 0.7]}, "broyden": {"initial": {"source": "probe"}}})
-    request = RunRequest(f"fmu:{tmp_path / 'crane.toml'}", "broyden", "target", "none", 0)
-    row = run_experiment(request, settings).row
-    assert row["status"] == "fmu_error"
-    assert message in row["reason"]

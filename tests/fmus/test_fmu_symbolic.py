@@ -125,6 +125,7 @@ def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_ar
     assert steps["jacobian_error"].notna().sum() > 20
 
 
+@pytest.mark.slow
 def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     path = mapped(tmp_path, MAPPING + NOMINAL)
     experiment = build_experiment(request(path, "constant"), quiet(path))
