@@ -13,7 +13,7 @@ from measuring import asked_to_be_quick, microseconds, processor_time, table
 from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.controllers.servo import ServoController
 from servobench.fmus.compiler import this_platform
-from servobench.harness.config.adapters import NoSettings
+from servobench.harness.config.entries import NoSettings
 from servobench.harness.config.fmu_controller import mapped_controller
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build

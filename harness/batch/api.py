@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import operator
-import pickle
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,10 +13,11 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
+from servobench.harness.batch.blocks import can_travel
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import Batch, Cell, Grid
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offered, offering
+from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
@@ -143,7 +142,7 @@ def compare(
         worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
-        if not _can_travel(offered([*worlds, *names, *batch.tasks])):
+        if not can_travel(offered([*worlds, *names, *batch.tasks])):
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)
 
@@ -197,12 +196,3 @@ def load(folder: Path | str) -> Results:
 
 def _task_name(given: str) -> str:
     return choose_task(given) if isinstance(given, str) else given  # a request refuses the others
-
-
-def _can_travel(own: tuple[Offer, ...]) -> bool:
-    """Return whether a worker process can receive these controllers and plants."""
-    try:
-        text = pickle.dumps(own)
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return False
-    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")

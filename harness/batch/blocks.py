@@ -17,6 +17,7 @@ import math
 import os
 import pickle
 import re
+import sys
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
@@ -33,7 +34,7 @@ import pandas as pd
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits
-from servobench.harness.batch.sandbox import LOST, POSSIBLE, Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.sandbox import LOST, Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -376,19 +377,16 @@ MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.bl
 
 def default_workers() -> int:
     """Return the number of worker processes that are used where none is given."""
-    if not POSSIBLE:
-        return 1
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(MAX_DEFAULT_WORKERS, available)
+    return min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
 
 
 def can_travel(own: Sequence[Offer]) -> bool:
-    """Return whether a worker process can receive controllers that users gave."""
+    """Return whether a worker process can receive controllers and plants that users gave."""
     try:
-        pickle.dumps(own)
+        text = pickle.dumps(own)
     except Exception:  # noqa: BLE001 - code of users may raise anything
         return False
-    return True
+    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")
 
 
 @contextlib.contextmanager
@@ -432,9 +430,7 @@ def open_workers(
     foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
     foreign = foreign or any(map(is_foreign_controller, controllers))
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
-    if not POSSIBLE and (count > 1 or bounds.run_timeout is not None or bounds.run_memory is not None):
-        raise ConfigurationError("worker processes and limits of runs need a system that can copy processes: use Linux")
-    if not POSSIBLE or (count == 1 and limits == Limits()):
+    if count == 1 and limits == Limits():
         yield Workers()
         return
     pool = Pool(count, limits, (*MODULES, *own_modules(plants, controllers)))

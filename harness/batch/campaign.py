@@ -15,6 +15,8 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
 
+import pandas as pd
+
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import (
     BLOCK,
@@ -61,6 +63,7 @@ class Campaign:
     cells: Sequence[Cell]  # in the order of the table
     settings: Settings  # overrides of the defaults
     steps: bool = False  # keep the table of steps, too
+    timed: bool = False  # each run goes by itself, so that its steps have times
 
 
 def comparison(batch: Batch, settings: Settings) -> Campaign:
@@ -101,10 +104,6 @@ class Execution:
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
     debug: bool = False  # raise the error of a run that crashes; the runs go one by one in this process
 
-    def of_part(self, folder: Path) -> Execution:
-        """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
-        return replace(self, resume=self.resume and folder.exists())
-
 
 def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) -> None:
     """Check and carry out the runs of a campaign and put its tables together.
@@ -124,7 +123,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     elif not is_unused(folder):
         check_resumable(folder)
     runs = survey(Grid(_request, campaign.cells))
-    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
+    own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
@@ -132,10 +131,22 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         _carry_out_at(place, campaign, runs, own, folder, how)
 
 
+def carry_out_parts(parts: Mapping[str, Campaign], folder: Path, how: Execution) -> dict[str, pd.DataFrame]:
+    """Carry out the campaigns of a study, each in a folder of its name, and return their tables of runs.
+
+    Raises:
+        ConfigurationError: as `carry_out`.
+    """
+    for name, campaign in parts.items():  # one that was not begun cannot be resumed
+        carry_out(campaign, folder / name, replace(how, resume=how.resume and (folder / name).exists()))
+    return {name: results.load_runs(folder / name) for name in parts}
+
+
 def _carry_out_at(
     place: Workers, campaign: Campaign, runs: Survey, own: tuple[Offer, ...], folder: Path, how: Execution
 ) -> None:
     """Check and carry out a campaign at a place."""
+    how = replace(how, block=1) if campaign.timed else how
     sections = check_campaign(campaign, runs, how.observer, place)
     jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
     side_by_side = jobs.side_by_side(runs.examples)
@@ -172,14 +183,13 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
         ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
     refuse_tuning_seeds(chain.from_iterable(runs.seeds))
-    check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
+    check_settings(campaign.settings, runs.sections)
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
-    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
-            build_block(Block((job,), own), place, observer.training)
+            build_block(Block((job,), offered(runs.sections)), place, observer.training)
         else:
             build_once(job.run, observer.training)
     return sections

@@ -12,7 +12,7 @@ from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.batch.tables import DamagedFile, lacking, sums_of, writing
 from servobench.harness.run.result import log_entry
-from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.checksums import SUMS, digest, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
@@ -59,22 +59,22 @@ def examine(folder: Path) -> Examination:
         ConfigurationError: there is no such folder, or nothing of a batch is in it.
     """
     check_resumable(folder)
-    sums, findings, manifest = sums_of(folder), [], {}
+    findings, manifest = [], dict[str, Any]()
     try:
         manifest = results.read_manifest(folder)
     except ConfigurationError as error:
         unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
         findings.append(Finding(MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"))
-    if sums is None:
+    if sums_of(folder) is None:
         remedy = f"if you trust the files as they are: cd {folder} && sha256sum {MANIFEST} *.parquet > {SUMS}"
         findings.append(Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy))
-    names = [name for name in (RUNS, STEPS, FAILURES) if (folder / name).exists() or name in (sums or {})]
-    faults = {name: wrong for name in names if (wrong := _fault(folder, name, sums))}
+    names = [name for name in (RUNS, STEPS, FAILURES) if results.is_expected(folder, name)]
+    faults = {name: wrong for name in names if (wrong := _fault(folder, name))}
     for name, wrong in faults.items():
         remedy = "it is written anew, without traces" if name == FAILURES else "runs that are in no part are repeated"
         findings.append(Finding(name, wrong, f"{AGAIN}; {remedy}"))
     count = 0
-    for part in _parts(folder, sums, manifest.get("campaign")):
+    for part in _parts(folder, manifest.get("campaign")):
         names += part.names
         count += part.count
         if part.fault:
@@ -106,10 +106,9 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
     Yields:
         A line for each damaged file.
     """
-    sums = sums_of(folder)
-    kept: dict[str, frozenset[str]] = {}
+    sums, kept = sums_of(folder) or {}, dict[str, frozenset[str]]()
     with writing(folder):
-        for part in _parts(folder, sums, manifest["campaign"]):
+        for part in _parts(folder, manifest["campaign"]):
             if part.fault:
                 yield f"{folder / part.wrong} {part.fault}: its runs are carried out again"
                 for name in reversed(part.names):  # the rows first: without them the part does not count
@@ -117,8 +116,8 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
             else:
                 kept |= {name: frozenset([digest(folder / name)]) for name in part.names}
         for name in (MANIFEST, RUNS, STEPS, FAILURES):
-            wrong = _fault(folder, name, sums) if (folder / name).exists() or name in (sums or {}) else None
-            if sums is not None and name in sums:
+            wrong = _fault(folder, name) if results.is_expected(folder, name) else None
+            if name in sums:
                 kept[name] = sums[name]
             elif (wrong is None or name == MANIFEST) and (folder / name).exists():
                 kept[name] = frozenset([digest(folder / name)])
@@ -131,7 +130,7 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
         if not results.is_whole(folder, manifest["run_count"]):
             (folder / PARTS).mkdir(exist_ok=True)
             return
-        if FAILURES in kept and (wrong := fault(folder, FAILURES, kept)):
+        if FAILURES in kept and (wrong := results.file_fault(folder, FAILURES)):
             yield f"{folder / FAILURES} {wrong}: it is written anew, without traces"
             write_vouched(folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")})
 
@@ -161,8 +160,7 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
         return ""
     names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
     names += [RUNS] if (folder / RUNS).exists() else []
-    sums = sums_of(folder)
-    intact = [name for name in names if _fault(folder, name, sums) is None]  # the others are made again in any case
+    intact = [name for name in names if _fault(folder, name) is None]  # the others are made again in any case
     owners = {tables.owner(folder, name).partition("@")[0] for name in intact}
     if owners - {manifest["campaign"]} or not owners:
         raise ConfigurationError(
@@ -182,13 +180,13 @@ class _Part:
     fault: str = ""  # of that file
 
 
-def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_Part]:
+def _parts(folder: Path, campaign: str | None) -> Iterator[_Part]:
     """Yield the parts of a folder, in order; where `campaign` is not known, parts may be of any."""
     end = 0
     for index in results.part_indices(folder):
         names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
-        names = [name for name in names if (folder / name).exists() or name in (sums or {})]
-        faults = [(name, wrong) for name in names if (wrong := _fault(folder, name, sums))]
+        names = [name for name in names if results.is_expected(folder, name)]
+        faults = [(name, wrong) for name in names if (wrong := _fault(folder, name))]
         rows = results.part_name(index, RUNS)
         if not faults:
             batch, _, first = tables.owner(folder, rows).rpartition("@")
@@ -206,10 +204,10 @@ def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_P
             yield _Part(names, count)
 
 
-def _fault(folder: Path, name: str, sums: Sums | None) -> str | None:
+def _fault(folder: Path, name: str) -> str | None:
     """Return the fault of a file; a table without a checksum is read as a whole."""
-    wrong = fault(folder, name, sums)
-    if wrong is None and sums is None and name.endswith(".parquet"):
+    wrong = results.file_fault(folder, name)
+    if wrong is None and sums_of(folder) is None and name.endswith(".parquet"):
         try:
             columns = tables.common_schema(folder, [name]).names
             for _ in tables.row_groups(folder, name, columns):

@@ -149,8 +149,8 @@ def _same(path: Path, descriptor: int) -> bool:
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError, ImportError):  # a user without a name, as in a container
-        return f"user {os.getuid()}" if hasattr(os, "getuid") else "an unknown user"
+    except (OSError, KeyError):  # a user without a name, as in a container
+        return f"user {os.getuid()}"
 
 
 def _start_of(pid: int) -> str:

@@ -215,12 +215,17 @@ class SweepPlan:
         axes, settings = [], dict[str, tuple[Value, ...]]()
         for text in variations:
             name, _, values = (part.strip() for part in text.partition("="))
-            if name not in SHORT_NAMES and "." not in name:
-                axes.append(parse_axis(name, values))
-            elif name in settings:
+            if name in settings:
                 raise ConfigurationError(f"--vary gives {name} twice; give all values in one place")
-            else:
-                settings[name] = parse_values(name, values)
+            try:
+                if name in SHORT_NAMES or "." in name:
+                    settings[name] = parse_values(name, values)
+                else:
+                    axes.append((name, parse_magnitudes(name, values)))
+            except ConfigurationError:
+                raise
+            except ValueError as error:
+                raise ConfigurationError(f"--vary: {error}") from error
         in_order = sorted(settings.items(), key=lambda pair: [*SHORT_NAMES, pair[0]].index(pair[0]))
         return cls(batch, tuple(axes), tuple(in_order))
 
@@ -282,34 +287,18 @@ def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
     return mismatch.with_axis(axis, magnitude)
 
 
-def parse_axis(axis: str, values: str) -> tuple[str, tuple[Magnitude, ...]]:
-    """Return an axis and its magnitudes, given as `begin:end:step` (both ends included) or `one/another`.
-
-    The unit stands at the end, as in `0:180:30deg`.
-
-    Raises:
-        ConfigurationError: an unknown axis, or an empty or malformed range.
-    """
-    try:
-        return axis, parse_magnitudes(axis, values)
-    except ValueError as error:
-        raise ConfigurationError(f"--vary: {error}") from error
-
-
 def parse_values(name: str, text: str) -> tuple[Value, ...]:
     """Return the values of a setting: `begin:end:step` (both ends included) or values as in TOML with commas between.
 
     Whole numbers become floats where others are floats, so that a column has one type.
 
     Raises:
-        ConfigurationError: there is no value, one stands there twice, or the range is malformed or empty.
+        ConfigurationError: there is no value, or one stands there twice.
+        ValueError: the range is malformed or empty.
     """
     values: Sequence[Any]
     if re.fullmatch(r"[-+0-9.e]+(:[-+0-9.e]+){2}", text):
-        try:
-            values = parse_range(name, text)
-        except ValueError as error:
-            raise ConfigurationError(f"--vary: {error}") from error
+        values = parse_range(name, text)
     else:
         try:
             values = tomllib.loads(f"values = [{text}]")["values"]
@@ -343,6 +332,11 @@ class Survey:
     """With every plant in every condition (mismatch, varied settings) and with every controller, and every task."""
     digest: str = ""  # of all runs in their order
 
+    @property
+    def sections(self) -> list[str]:
+        """The sections of settings that the runs read, apart from `run`."""
+        return [*self.plants, *self.controllers, *self.tasks]
+
 
 def survey(requests: Sequence[RunRequest]) -> Survey:
     """Look at every run once.
@@ -351,14 +345,14 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         ConfigurationError: a run is asked for twice.
     """
     found = Survey(len(requests))
-    digest, names, seeds = hashlib.sha256(), array("q"), _Ranges()
+    digest, names, seeds = hashlib.sha256(), array("q"), array("q")
     kind: tuple[object, ...] = ()
     seen: set[tuple[object, ...]] = set()
     for request in requests:
         run_id = request.run_id
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
-        seeds.add(request.seed)
+        seeds.append(request.seed)
         condition = (request.mismatch, request.varied, request.robot, request.sensing)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
@@ -373,7 +367,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         found.mismatches[str(example.mismatch)] = found.sensings[example.sensing] = None
         if not find_plant(example.plant).own_robot:
             found.robots[example.robot] = None
-    found.digest, found.seeds = digest.hexdigest(), seeds.merged()
+    found.digest, found.seeds = digest.hexdigest(), _ranges(seeds)
     _refuse_repetition(requests, names)
     return found
 
@@ -389,24 +383,8 @@ def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> No
             raise ConfigurationError(f"the run {name} is asked for twice")
 
 
-class _Ranges:
-    """Collects whole numbers as ranges, which are few where the numbers rise one by one again and again."""
-
-    def __init__(self) -> None:
-        self._begin = self._end = 0
-        self._done: set[tuple[int, int]] = set()
-
-    def add(self, number: int) -> None:
-        if number != self._end:
-            self._done.add((self._begin, self._end))
-            self._begin = number
-        self._end = number + 1
-
-    def merged(self) -> list[range]:
-        merged: list[range] = []
-        for begin, end in sorted({*self._done, (self._begin, self._end)}):
-            if merged and begin <= merged[-1].stop:
-                merged[-1] = range(merged[-1].start, max(end, merged[-1].stop))
-            elif end > begin:
-                merged.append(range(begin, end))
-        return merged
+def _ranges(numbers: array[int]) -> list[range]:
+    """Return whole numbers as ranges, in order."""
+    found = np.unique(np.frombuffer(numbers, dtype=np.int64))
+    parts = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1) if len(found) else []
+    return [range(int(part[0]), int(part[-1]) + 1) for part in parts]

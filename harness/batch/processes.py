@@ -1,7 +1,7 @@
 """Limits of runs, and the processes below one: their ids, their memory, their end, their ties to the one above.
 
-The one module that imports psutil. On Linux a process can adopt the orphans among its descendants, so that a child
-that was started in a session of its own, with its parent gone, also stays below the process that answers for it.
+For Linux, where a process can adopt the orphans among its descendants, so that a child that was started in a session
+of its own, with its parent gone, also stays below the process that answers for it. The one module that imports psutil.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import ctypes
 import math
 import os
 import re
+import resource
 import signal
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,8 +21,6 @@ from typing import Final
 
 import psutil
 
-LINUX: Final = sys.platform == "linux"
-LISTED: Final = Path("/proc/thread-self/children").exists()  # whether the system lists the children of a process
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
 FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
@@ -83,8 +81,7 @@ def wake_without_parent() -> None:
 
 
 def _prctl(option: int, value: int) -> None:
-    if LINUX:
-        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+    ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
 def descendants(process: int) -> list[int]:
@@ -100,12 +97,10 @@ def descendants(process: int) -> list[int]:
 def _children(process: int) -> list[int]:
     """Return the ids of the children of a process."""
     try:
-        if LISTED:
-            lists = [(task / "children").read_text() for task in Path(f"/proc/{process}/task").iterdir()]
-            return [int(word) for text in lists for word in text.split()]
-        return [child.pid for child in psutil.Process(process).children()]
-    except (FileNotFoundError, ProcessLookupError, psutil.Error):  # it has ended
+        lists = [(task / "children").read_text() for task in Path(f"/proc/{process}/task").iterdir()]
+    except (FileNotFoundError, ProcessLookupError):  # it has ended
         return []
+    return [int(word) for text in lists for word in text.split()]
 
 
 def resident_memory(processes: Iterable[int]) -> int:
@@ -115,7 +110,7 @@ def resident_memory(processes: Iterable[int]) -> int:
 
 def own_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    return sum(_memory(process, "pss" if LINUX else "uss") for process in processes)
+    return sum(_memory(process, "pss") for process in processes)
 
 
 def _memory(process: int, kind: str) -> int:
@@ -136,10 +131,8 @@ def limit_resources(memory: int | None) -> None:
 
     Not all addresses are memory: drivers of graphics cards reserve hundreds of gigabytes of them.
     """
-    import resource  # noqa: PLC0415 - not on Windows
-
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    if memory is not None and LINUX:
+    if memory is not None:
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
         soft = psutil.Process().memory_info().vms + memory
         if hard == resource.RLIM_INFINITY or soft < hard:

@@ -26,7 +26,7 @@ from servobench.harness.batch import tables
 from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
 from servobench.harness.run.result import RunResult, log_entry
-from servobench.plant.contract.checksums import SUMS, Sums, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.checksums import SUMS, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, write_atomically
 
@@ -130,10 +130,10 @@ def part_indices(folder: Path) -> list[int]:
     return sorted(int(match[1]) for match in matches if match)
 
 
-def part_names(folder: Path, kind: str, sums: Sums | None) -> list[str]:
+def part_names(folder: Path, kind: str) -> list[str]:
     """Return the names of the files of one kind that the parts have, or should have, in order."""
     names = (part_name(index, kind) for index in part_indices(folder))
-    return [name for name in names if (folder / name).is_file() or name in (sums or {})]
+    return [name for name in names if is_expected(folder, name)]
 
 
 def finished_runs(folder: Path) -> list[range]:
@@ -143,8 +143,7 @@ def finished_runs(folder: Path) -> list[range]:
 
 def is_whole(folder: Path, wanted: int) -> bool:
     """Return whether the tables of a folder are undamaged, and have at least as many runs as are wanted."""
-    sums = sums_of(folder)
-    if any(fault(folder, name, sums) for name in (RUNS, STEPS) if name == RUNS or _expected(folder, name, sums)):
+    if any(file_fault(folder, name) for name in (RUNS, STEPS) if name == RUNS or is_expected(folder, name)):
         return False
     with contextlib.suppress(DamagedFile):
         return tables.row_count(folder, RUNS) >= wanted
@@ -170,13 +169,12 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
     if is_whole(folder, wanted):  # at most the clean-up is left
         shutil.rmtree(folder / PARTS, ignore_errors=True)
         return tables.row_count(folder, RUNS)
-    sums = sums_of(folder)
     if not part_indices(folder):
-        _refuse_damaged(folder, [name for name in (RUNS, STEPS) if _expected(folder, name, sums)])
+        _refuse_damaged(folder, [name for name in (RUNS, STEPS) if is_expected(folder, name)])
         raise ConfigurationError(f"{folder} holds no finished run")
     files: dict[str, Callable[[Path], object]] = {}
     for kind in (STEPS, FAILURES, RUNS):
-        names = part_names(folder, kind, sums)
+        names = part_names(folder, kind)
         _refuse_damaged(folder, names)
         if names and kind == FAILURES:
             files[kind] = _text("".join((folder / name).read_text(encoding="utf-8") for name in names))
@@ -251,7 +249,7 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
 
 def has_steps(folder: Path) -> bool:
     """Return whether a results folder has a table of steps."""
-    return (folder / STEPS).is_file() or bool(part_names(folder, STEPS, None))
+    return (folder / STEPS).is_file() or bool(part_names(folder, STEPS))
 
 
 def check_folder(folder: Path) -> None:
@@ -271,7 +269,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: not a results folder, one of another schema, or the manifest is damaged.
     """
-    if _expected(folder, MANIFEST, sums_of(folder)):
+    if is_expected(folder, MANIFEST):
         _refuse_damaged(folder, [MANIFEST])
     try:
         text = (folder / MANIFEST).read_text(encoding="utf-8")
@@ -280,14 +278,19 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read") from error
 
 
-def _expected(folder: Path, name: str, sums: Sums | None) -> bool:
+def is_expected(folder: Path, name: str) -> bool:
     """Return whether a folder has a file, or should have it."""
-    return (folder / name).exists() or name in (sums or {})
+    return (folder / name).exists() or name in (sums_of(folder) or {})
+
+
+def file_fault(folder: Path, name: str) -> str | None:
+    """Return the fault of a file by the checksums of its folder, as a predicate; None if there is none."""
+    return fault(folder, name, sums_of(folder))
 
 
 def _intact(folder: Path, kind: str) -> list[str]:
     """Return the names of the table of one kind, or of its parts, all of them undamaged."""
-    names = [kind] if (folder / kind).is_file() else part_names(folder, kind, sums_of(folder))
+    names = [kind] if (folder / kind).is_file() else part_names(folder, kind)
     _refuse_damaged(folder, names)
     return names
 
@@ -298,9 +301,8 @@ def _refuse_damaged(folder: Path, names: Sequence[str]) -> None:
     Raises:
         DamagedFile: names the first of them.
     """
-    sums = sums_of(folder)
     for name in names:
-        if (wrong := fault(folder, name, sums)) is not None:
+        if (wrong := file_fault(folder, name)) is not None:
             raise DamagedFile(folder, name, wrong)
 
 

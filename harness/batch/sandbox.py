@@ -7,7 +7,7 @@ Answers are data: JSON, which is read and never executed, since code of users ma
 copy of the guard, so that a new one takes milliseconds. It is ended, with every process below the guard, when a run
 takes too long, holds too much memory or kills it; when the code of users changes, so that no plug-in meets the remains
 of another; when a task is over and left processes or much memory behind; and when the link to this process closes,
-also because this process was killed. A system that cannot copy processes (Windows) has no sandbox.
+also because this process was killed. For Linux only.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from servobench.harness.batch.processes import Limits, show_size
 from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError
 
-POSSIBLE: Final = hasattr(os, "fork")  # whether this system has sandboxes
 LOST: Final = "the run killed the process that carried it out"
 STOPPED: Final = "the run stopped the process that guards it"
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
@@ -105,7 +104,7 @@ class Workers:
 
 
 def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell) -> Ending | None:
-    """Call a function in a sandbox, which is a copy of this process; without sandboxes, in this process.
+    """Call a function in a sandbox, which is a copy of this process.
 
     Args:
         function: takes the argument and `tell`, which passes an answer of JSON values on.
@@ -116,9 +115,6 @@ def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits
     Returns:
         How the function ended if it did not return.
     """
-    if not POSSIBLE:
-        function(argument, lambda item: None if item is None else hear(item))
-        return None
     sandbox = Sandbox(limits, (), copied=True)
     try:
         end = sandbox.carry_out(Task(function, pickle.dumps(argument), "user"), hear).end

@@ -12,11 +12,12 @@ from typing import Any, Final
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, at, attributes, differing, watching_draws
-from servobench.harness.config.adapters import folder_of
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
+from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws
 from servobench.harness.config.defaults import default_config
+from servobench.harness.config.entries import folder_of
 from servobench.harness.config.registry import choose_controller, find_controller, offering
+from servobench.harness.run.contract import HeldController
 from servobench.plant.contract.faults import ConfigurationError
 
 JOINTS, FEATURES = 6, 3
@@ -52,25 +53,15 @@ def check_controller(
     """
     with offering():
         name = choose_controller(controller)
-        findings = []
-        for finding in ControllerChecks(find_controller(name)).carry_out(begin):
-            findings.append(finding)
-            found(finding)
-    return Report(name, tuple(findings))
+        return report(name, ControllerChecks(find_controller(name)).carry_out(begin), found)
 
 
 class ControllerChecks:
     """The checks of one controller."""
 
-    def __init__(self, entry: ControllerEntry, rig: Callable[[int, int], Rig] = Rig) -> None:
-        """Prepare the checks.
-
-        Args:
-            entry: of the controller.
-            rig: makes an arm of n joints and m features.
-        """
-        self.entry, self.rig, self.steps = entry, rig, STEPS
-        self.folder = folder_of(entry.build)
+    def __init__(self, entry: ControllerEntry) -> None:
+        """Prepare the checks."""
+        self.entry, self.steps, self.folder = entry, STEPS, folder_of(entry.build)
         self._times: list[float] = []
         self._printed = ""
 
@@ -128,22 +119,12 @@ class ControllerChecks:
         """The log gets named numbers and a Jacobian."""
         driver = self._driver().begin()
         driver.run(1)
-        controller, spec = driver.controller, driver.rig.spec
-        named: Any = controller.diagnostics()
-        try:
-            shapes = {str(name): np.shape(np.asarray(value, dtype=np.float64)) for name, value in named.items()}
-        except (AttributeError, TypeError, ValueError) as error:
+        held = HeldController(driver.controller, driver.rig.spec)
+        held.diagnostics()
+        J = held.estimated_jacobian()
+        if J is not None and not np.isfinite(J).all():
             raise CheckFailed(
-                f"{at(controller.diagnostics)}: diagnostics must return names with numbers, got {named!r}"
-            ) from error
-        for name, shape in shapes.items():
-            if shape:
-                raise CheckFailed(f"{at(controller.diagnostics)}: {name} must be one number, got shape {shape}")
-        J: Any = controller.estimated_jacobian()
-        if J is not None and (np.shape(J) != (spec.m, spec.n) or not np.isfinite(J).all()):
-            raise CheckFailed(
-                f"{at(controller.estimated_jacobian)}: estimated_jacobian must return {(spec.m, spec.n)} finite "
-                f"numbers or None, got shape {np.shape(J)}"
+                f"{at(driver.controller.estimated_jacobian)}: estimated_jacobian must return finite numbers or None"
             )
 
     def repeatable(self) -> None:
@@ -230,7 +211,7 @@ class ControllerChecks:
         n, m = OTHER_SIZES
         what = f"{n} joints and {m} features"
         try:
-            knowledge = self.rig(n, m).knowledge(truth=self.entry.needs_truth)
+            knowledge = Rig(n, m).knowledge(truth=self.entry.needs_truth)
             controller = self.entry.build(default_config(self.entry), knowledge)
         except ConfigurationError as error:
             if "ValueError" in str(error):
@@ -239,9 +220,7 @@ class ControllerChecks:
         except ValueError as error:
             return f"it refuses {what}: {error}"
         try:
-            Driver(controller, self.rig(n, m)).begin().run(min(self.steps, 6))
-        except CheckFailed as failure:
-            raise CheckFailed(f"{failure}; this happens with {what}: take n and m from knowledge.spec") from failure
+            Driver(controller, Rig(n, m)).begin().run(min(self.steps, 6))
         except Exception as error:
             error.args = (f"{error}; this happens with {what}: take n and m from knowledge.spec",)
             raise
@@ -285,7 +264,7 @@ class ControllerChecks:
         return f"it prints {lines} lines in {self.steps} steps; numbers for the log are returned by diagnostics"
 
     def _build(self, preview: int | None = None) -> tuple[Controller, Rig]:
-        rig = self.rig(JOINTS, FEATURES)
+        rig = Rig(JOINTS, FEATURES)
         knowledge = rig.knowledge(truth=self.entry.needs_truth)
         if preview is not None:
             knowledge = replace(knowledge, preview=preview)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from servobench.harness.config.source import describe_at
+from servobench.harness.config.source import describe_at, show
+from servobench.harness.run.result import WrongAnswer
 from servobench.plant.contract.faults import ConfigurationError
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
@@ -55,6 +57,15 @@ class Report:
     __repr__ = __str__
 
 
+def report(subject: str, findings: Iterable[Finding], found: Callable[[Finding], None]) -> Report:
+    """Return the findings about a subject; each is handed to `found` as soon as it is there."""
+    kept = []
+    for finding in findings:
+        kept.append(finding)
+        found(finding)
+    return Report(subject, tuple(kept))
+
+
 class CheckFailed(Exception):
     """A check found a defect; the message names the remedy."""
 
@@ -85,15 +96,21 @@ def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], No
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise"):
                 note = check.carry_out()
-        except CheckFailed as failure:
-            yield Finding(check.name, "failed", str(failure))
-        except ConfigurationError as error:
+        except (CheckFailed, ConfigurationError) as error:
             yield Finding(check.name, "failed", str(error))
+        except WrongAnswer as error:
+            yield Finding(check.name, "failed", f"{at(error.method)}: {error}")
         except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
             yield Finding(check.name, "failed", describe_at(error, folder) + _remedy(error))
         else:
             good.add(check.name)
             yield Finding(check.name, "note", note) if note else Finding(check.name, "ok")
+
+
+def at(method: Any) -> str:  # noqa: ANN401 - a method or a function
+    """Return `FILE:LINE` of a method."""
+    code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
+    return f"{show(Path(code.co_filename))}:{code.co_firstlineno}" if code else "step"
 
 
 def _remedy(error: BaseException) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import random
 import traceback
 from collections.abc import Iterator
@@ -18,8 +17,9 @@ import numpy as np
 from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.harness.check.report import CheckFailed
+from servobench.harness.check.report import CheckFailed, at
 from servobench.harness.config.source import PACKAGES, show
+from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
@@ -144,6 +144,7 @@ class Driver:
     def __init__(self, controller: Controller, rig: Rig, seed: int = 0) -> None:
         """Take controller, rig, and the seed of the noise, which `reset` gets, too."""
         self.controller, self.rig, self.seed = controller, rig, seed
+        self._watched = _Watched(controller, rig.spec)
         self.times: list[float] = []  # [s] of each step
 
     def begin(self) -> Driver:
@@ -152,17 +153,18 @@ class Driver:
         desired = conditions.scale * np.tile(goal, (MAX_PERIODS + conditions.preview, 1))
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)
-        self.rollout = begin(self.rig, self.controller, desired, length, (self.seed, self.seed))
+        self.rollout = begin(self.rig, self._watched, desired, length, (self.seed, self.seed))
         return self
 
     def run(self, count: int) -> FloatArray:
         """Return the commands (count, n) [rad/s] of the next periods.
 
         Raises:
-            CheckFailed: one is no command of n finite numbers, or `step` changed its arguments.
+            CheckFailed: `step` changed its arguments.
+            WrongAnswer: it returned no command of n finite numbers.
         """
         commands = []
-        for period in islice(periods(self.rollout, _Watched(self.controller, self.rig.spec.n)), count):
+        for period in islice(periods(self.rollout, self._watched), count):
             self.times.append(1e-9 * period.nanoseconds[0])
             commands.append(period.command.joint_velocity)
         return np.array(commands)
@@ -170,48 +172,28 @@ class Driver:
 
 @final
 class _Watched(Controller):
-    """A controller whose steps must return a command and leave their arguments as they are."""
+    """A controller whose answers are checked, and whose steps must leave their arguments as they are."""
 
-    def __init__(self, controller: Controller, n: int) -> None:
-        self._controller, self._n = controller, n
+    def __init__(self, controller: Controller, spec: PlantSpec) -> None:
+        self._controller, self._held = controller, HeldController(controller, spec)
 
     def reset(self, observation: Observation, seed: int) -> None:
         """See `Controller.reset`."""
-        self._controller.reset(observation, seed)
+        self._held.reset(observation, seed)
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
         reference = reference.copy()  # whose flag a controller can set, as that of any array of its own
         reference.flags.writeable = False
         given = _bytes(observation, reference)
-        command = self._controller.step(observation, reference)
-        _check_command(command, self._controller, self._n)
+        command = self._held.step(observation, reference)
         if _bytes(observation, reference) != given:
             raise CheckFailed(f"{at(self._controller.step)}: step changes its arguments; work on a copy")
         return command
 
 
-def at(method: Any) -> str:  # noqa: ANN401 - a method or a function
-    """Return `FILE:LINE` of a method."""
-    code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
-    return f"{show(Path(code.co_filename))}:{code.co_firstlineno}" if code else "step"
-
-
 def _bytes(observation: Observation, reference: FloatArray) -> tuple[bytes, ...]:
     return observation.joint_position.tobytes(), observation.feature.tobytes(), reference.tobytes()
-
-
-def _check_command(command: object, controller: Controller, n: int) -> None:
-    where = at(controller.step)
-    if not isinstance(command, Command):
-        raise CheckFailed(
-            f"{where}: step must return a servobench.Command, got {type(command).__name__}; "
-            "end it with return servobench.Command(u)"
-        )
-    if command.joint_velocity.shape != (n,):
-        raise CheckFailed(
-            f"{where}: the command must have shape ({n},), a number for each joint, got {command.joint_velocity.shape}"
-        )
 
 
 @dataclass

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -15,11 +16,11 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.status import Status
 from rich.text import Text
 
 from servobench.harness.batch.campaign import Observer, Row
@@ -80,18 +81,33 @@ class RateColumn(ProgressColumn):
         return Text("" if task.speed is None else f"{task.speed:.1f} runs/s")
 
 
-def run_progress(console: Console, *further: ProgressColumn) -> Progress:
-    """Return a bar with a description, counts and the time left."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *further,
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    )
+class Bars(Progress):
+    """Work of known size: bars with counts and the time left in a terminal, elsewhere a line now and then.
+
+    Args:
+        console: where.
+        further: columns behind the counts.
+        shown: false where a debugger may need the terminal.
+    """
+
+    def __init__(self, console: Console, *further: ProgressColumn, shown: bool = True) -> None:
+        counts = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+        times = TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+        super().__init__(*counts, *further, *times, console=console, disable=not shown)
+        self._lines, self._begun = Lines(), 0
+
+    def begin(self, name: str, total: int, done: int = 0, **fields: Any) -> TaskID:  # noqa: ANN401 - those of rich
+        """Begin a bar; `fields` are for the further columns."""
+        self._begun += done
+        return self.add_task(name, total=total, completed=done, **fields)
+
+    def reach(self, bar: TaskID, done: int, text: str, **fields: Any) -> None:  # noqa: ANN401 - those of rich
+        """Move a bar; `text` is the line where there are none."""
+        self.update(bar, completed=done, **fields)
+        if not self.console.is_terminal:
+            missing = sum((task.total or 0.0) - task.completed for task in self.tasks)
+            finished = sum(task.completed for task in self.tasks) - self._begun
+            self._lines.tell(finished / max(finished + missing, 1.0), text)
 
 
 class ConsoleObserver(Observer):
@@ -103,38 +119,25 @@ class ConsoleObserver(Observer):
     """
 
     def __init__(self, console: Console, *, bar: bool = True) -> None:
-        self._console, self._shows_bar = console, bar
-        self._status: Status | None = console.status("checking the configuration")
-        self._status.start()
-        self._bar: Progress | None = None
-        self._lines, self._training = Lines(), Lines()
-        self._done = self._begun = self._total = 0
+        self._console, self._shows_bar, self._shown = console, bar, contextlib.ExitStack()
+        self._tell = self._shown.enter_context(telling(console, "checking the configuration"))
+        self._done = self._total = 0
 
-    def training(self, share: float, what: str) -> None:
+    def training(self, share: float, subject: str) -> None:
         """Show how much of a training of networks is done."""
-        text = f"training networks once: {100 * share:3.0f} %, {what}"
-        if self._status is not None:
-            self._status.update(text)
-        if not self._console.is_terminal:
-            self._training.tell(share, text)
+        self._tell(share, f"training networks once, {subject}")
 
     def begin(self, total: int, done: int) -> None:
         """Show the bar."""
         self.close()
-        self._done, self._begun, self._total, self._lines = done, done, total, Lines()
-        if self._shows_bar:
-            self._bar = run_progress(self._console, RateColumn())
-            self._bar.add_task("running", total=total, completed=done)
-            self._bar.start()
+        self._done, self._total = done, total
+        self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
+        self._bar = self._bars.begin("running", total, done)
 
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
-        if self._bar is not None:
-            self._bar.advance(self._bar.task_ids[0], len(rows))
         self._done += len(rows)
-        if not self._console.is_terminal:
-            share = (self._done - self._begun) / (self._total - self._begun)
-            self._lines.tell(share, f"{self._done} of {self._total} runs")
+        self._bars.reach(self._bar, self._done, f"{self._done} of {self._total} runs")
 
     def note(self, text: str) -> None:
         """Print a line."""
@@ -142,10 +145,7 @@ class ConsoleObserver(Observer):
 
     def close(self) -> None:
         """Take line and bar away."""
-        for shown in (self._status, self._bar):
-            if shown is not None:
-                shown.stop()
-        self._status = self._bar = None
+        self._shown.close()
 
 
 @contextlib.contextmanager

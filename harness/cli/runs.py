@@ -14,7 +14,7 @@ import typer
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, refuse, say
+from servobench.harness.cli.terminal import INTERRUPTED, console, print_rows, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -140,8 +140,6 @@ def train(
 
     They are trained on the nominal model and kept for later runs. Prints their errors.
     """
-    from rich.table import Table
-
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.knowledge import NETWORKS
@@ -152,10 +150,11 @@ def train(
     check_settings(settings, [controller])
     with telling(console, "training") as tell:
         trained = train_networks(controller, settings, tell, robot, sensing)
-    table = Table("network", "held-out error")
-    table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
-    table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
-    console.print(table)
+    errors = {
+        "Jacobian: RMS of its error over RMS of itself": f"{100 * trained.jacobian_error:.2f} %",
+        "controller: RMS error of the commanded joint position": f"{trained.controller_error:.2e} rad",
+    }
+    print_rows(("network", "held-out error"), errors.items())
     say(f"kept in {cache_folder(NETWORKS)}")
 
 

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse, say
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rich.table import Table
-
     from servobench.harness.batch.sandbox import Workers
-    from servobench.harness.studies.tuning.campaign import Change, Method, TunedValues, TuningPlan
+    from servobench.harness.studies.tuning.campaign import Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
 DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
@@ -208,7 +206,7 @@ def tune(
         interrupted = not _advance(methods, plan, opened)
     results = write_results(out, methods)
     if results:
-        console.print(_tuned_table(results))
+        _print_tuned(results)
         say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:
         _say_interrupted()
@@ -221,69 +219,57 @@ def _say_interrupted() -> None:
 
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
     """Score every change of one value of the settings in use and say which of them improve a score by too much."""
-    from servobench.harness.cli.progress import Lines, run_progress
+    from servobench.harness.cli.progress import Bars
     from servobench.harness.studies.tuning.campaign import TOLERANCE, Check, improvements
 
-    checked, lines = Check(folder, names, runs), Lines()
+    checked = Check(folder, names, runs)
     total, begun = len(checked), checked.known()
-    with run_progress(console) as progress:
-        bar = progress.add_task("points", total=total, completed=begun)
-        try:
+    try:
+        with Bars(console) as bars:
+            bar = bars.begin("points", total, begun)
             for done, _ in enumerate(checked.carry_out(workers), begun + 1):
-                progress.update(bar, completed=done)
-                if not console.is_terminal:
-                    lines.tell((done - begun) / (total - begun), f"{done} of {total} points")
-        except KeyboardInterrupt:
-            progress.stop()
-            _say_interrupted()
+                bars.reach(bar, done, f"{done} of {total} points")
+    except KeyboardInterrupt:
+        _say_interrupted()
     found = improvements(checked.changes())
-    console.print(_change_table(found) if found else f"no change improves a score by more than {TOLERANCE:.0%}")
-    if found:
-        sys.exit(FAILED)
+    if not found:
+        say(f"no change improves a score by more than {TOLERANCE:.0%}")
+        return
+    rows = []
+    for change in found:
+        values = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in (change.before, change.after))
+        scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
+        rows.append((change.controller, change.key, *values, *scores))
+    print_rows(("controller", "key", "in use", "better", "score", "with the change", "gain"), rows)
+    sys.exit(FAILED)
 
 
 def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:
     """Advance the studies to their end and show how far they are; return whether they got there."""
     from rich.progress import TextColumn
 
-    from servobench.harness.cli.progress import Lines, run_progress
+    from servobench.harness.cli.progress import Bars
     from servobench.harness.studies.tuning.campaign import advance
 
-    total, lines = plan.studies * (plan.trials + plan.search), Lines()
-    begun = sum(method.done for method in methods)
-    with run_progress(console, TextColumn("points, best {task.fields[best]}")) as progress:
-        bars = {method.name: progress.add_task(method.name, total=total, best="–") for method in methods}
-        try:
+    total = plan.studies * (plan.trials + plan.search)
+    try:
+        with Bars(console, TextColumn("points, best {task.fields[best]}")) as bars:
+            shown = {method.name: bars.begin(method.name, total, method.done, best="–") for method in methods}
             for method in advance(methods, plan, workers):
                 score = method.ledger.best()
                 best = "–" if score is None else f"{score:.4f}"
-                progress.update(bars[method.name], completed=method.done, best=best)
-                if not console.is_terminal:
-                    done, every = sum(each.done for each in methods), total * len(methods)
-                    text = f"{method.name}: {method.done} of {total} points, best {best}; in all {done} of {every}"
-                    lines.tell((done - begun) / max(every - begun, 1), text)
-        except KeyboardInterrupt:
-            return False
+                done = sum(each.done for each in methods)
+                text = f"{method.done} of {total} points, best {best}; in all {done} of {total * len(methods)}"
+                bars.reach(shown[method.name], method.done, f"{method.name}: {text}", best=best)
+    except KeyboardInterrupt:
+        return False
     return True
 
 
-def _change_table(changes: Sequence[Change]) -> Table:
-    from rich.table import Table
-
-    table = Table("controller", "key", "in use", "better", "score", "with the change", "gain")
-    for change in changes:
-        values = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in (change.before, change.after))
-        scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
-        table.add_row(change.controller, change.key, *values, *scores)
-    return table
-
-
-def _tuned_table(results: Mapping[str, TunedValues]) -> Table:
-    from rich.table import Table
-
-    table = Table("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies")
+def _print_tuned(results: Mapping[str, TunedValues]) -> None:
+    rows = []
     for name, tuned in results.items():
         numbers = (tuned.score_of_defaults, tuned.score, tuned.second_score_of_defaults, tuned.second_score)
         spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
-        table.add_row(name, *(f"{number:.4f}" for number in numbers), spread)
-    return table
+        rows.append((name, *(f"{number:.4f}" for number in numbers), spread))
+    print_rows(("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies"), rows)

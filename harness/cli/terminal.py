@@ -67,6 +67,16 @@ def cleaning_up_when_terminated() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def print_rows(headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
+    """Print a table of text with lines around it."""
+    from rich.table import Table
+
+    table = Table(*headings)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
 def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -> None:
     """Print tables of text with their titles, and a legend below all of them.
 

@@ -22,7 +22,7 @@ import numpy as np
 from annotated_types import MinLen
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from servobench.harness.config.adapters import NoSettings
+from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.files import read_toml

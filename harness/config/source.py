@@ -102,41 +102,16 @@ class SourceFile:
             ConfigurationError: names the import and both files.
         """
         importlib.invalidate_caches()
-        waiting, seen = [(self.path, self.text)], {PACKAGE}
-        while waiting:
-            file, text = waiting.pop()
-            for name, line in _imports(text):
-                beside = _beside(self.path.parent, name)
-                if beside is None or name in seen:
-                    continue
-                seen.add(name)
-                taken = _origin(name)
-                if taken is not None and taken != beside:
-                    raise ConfigurationError(
-                        f"{show(file)}:{line}: import {name} would take {show(taken)} instead of {show(beside)}, "
-                        "as a process has one module of a name; give one of them another name"
-                    )
-                with contextlib.suppress(OSError, ValueError):
-                    waiting.append((beside, beside.read_text(encoding="utf-8")))
-
-
-def _imports(text: str) -> Iterator[tuple[str, int]]:
-    """Yield the top-level names of modules that a text imports, with the line; nothing of one that cannot be read."""
-    try:
-        tree = ast.parse(text)
-    except (SyntaxError, ValueError):
-        return
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((each.name.partition(".")[0], node.lineno) for each in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module.partition(".")[0], node.lineno
-
-
-def _beside(folder: Path, name: str) -> Path | None:
-    """Return the file in a folder that holds a module; None if there is none."""
-    candidates = folder / f"{name}.py", folder / name / "__init__.py"
-    return next((path.resolve() for path in candidates if path.is_file()), None)
+        for file, line, (name, *_) in traced_imports(self.path, self.path.parent):
+            beside = next(_files(self.path.parent, (name,)), None)
+            if beside is None or name == PACKAGE:
+                continue
+            taken, beside = _origin(name), beside.resolve()
+            if taken is not None and taken != beside:
+                raise ConfigurationError(
+                    f"{show(file)}:{line}: import {name} would take {show(taken)} instead of {show(beside)}, "
+                    "as a process has one module of a name; give one of them another name"
+                )
 
 
 def _origin(name: str) -> Path | None:
@@ -253,25 +228,28 @@ def neighbours(file: Path, root: Path) -> list[Path]:
         file: the file.
         root: the folder from which its imports start.
     """
-    waiting, found = [file], dict[Path, None]()
+    return sorted({path for _, _, name in traced_imports(file, root) for path in _files(root, name)} - {file})
+
+
+def traced_imports(file: Path, root: Path) -> Iterator[tuple[Path, int, Name]]:
+    """Yield each import of a file and of the files below a folder that it imports: file, line and name.
+
+    Nothing is yielded of a file that cannot be read. Arguments as of `neighbours`.
+    """
+    waiting, seen = [file], {file}
     while waiting:
-        for path in _imported(waiting.pop(), root):
-            if path not in found and path != file:
-                found[path] = None
-                waiting.append(path)
-    return sorted(found)
-
-
-def _imported(file: Path, root: Path) -> Iterator[Path]:
-    """Yield the files below a folder that a file imports itself; nothing of one that cannot be read."""
-    try:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-    except (OSError, SyntaxError, ValueError):
-        return
-    package = file.parent.relative_to(root).parts
-    for node in ast.walk(tree):
-        for name in _names(node, package):
-            yield from _files(root, name)
+        importing = waiting.pop()
+        try:
+            tree = ast.parse(importing.read_text(encoding="utf-8"))
+        except (OSError, SyntaxError, ValueError):
+            continue
+        package = importing.parent.relative_to(root).parts
+        for node in ast.walk(tree):
+            for name in _names(node, package):
+                yield importing, getattr(node, "lineno", 0), name
+                found = [path for path in _files(root, name) if path not in seen]
+                seen.update(found)
+                waiting += found
 
 
 def _names(node: ast.AST, package: Name) -> Iterator[Name]:

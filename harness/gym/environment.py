@@ -140,8 +140,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
         self.close()
         self._experiment = experiment = build(with_seed(self.resolved, run_seed))
-        rows = experiment.periods + 1 + experiment.run.preview_rows  # also those after the last period
-        desired = experiment.scenario.reference.sampled(self._spaces.spec.period, rows)
+        desired = experiment.desired(experiment.periods + 1)  # also after the last period
         self._action = np.zeros(self._spaces.spec.n)
         self._over = False
         info = {"seed": run_seed, "robot": experiment.drawn.as_record()}

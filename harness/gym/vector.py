@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, final
+from typing import Any, cast, final
 
 import gymnasium
 import numpy as np
@@ -12,8 +12,10 @@ from gymnasium.vector.utils import batch_space
 
 from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
 from servobench.harness.gym.spaces import Floats32, Spaces
-from servobench.harness.run.lanes import Together, build_together, side_by_side_key
+from servobench.harness.run.experiment import Experiment, build_together
+from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
+from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.seeds import named_seed
@@ -62,7 +64,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._many: Together | None = None
+        self._many: Experiment | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -87,14 +89,12 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         seeds = self.np_random.integers(SEEDS, size=count) if seed is None else seed + np.arange(count)
         self.close_extras()
         self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
-        self._spaces = Spaces(many.bench.spec, many.loop.preview)
-        rows = many.loop.periods + 1 + many.loop.preview  # also those after the last period
-        period = many.bench.spec.period
-        desired = np.stack([each.scenario.reference.sampled(period, rows) for each in many.drawn])
+        bench = self._bench = cast(Bench, many.plant)
+        self._spaces = Spaces(bench.spec, many.loop.preview)
         self._ended = False
-        self._action: FloatArray = np.zeros((self.num_envs, many.bench.spec.n))
-        observation = many.bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
-        self._rollout = Rollout(many.bench, observation, desired, many.loop)
+        self._action: FloatArray = np.zeros((self.num_envs, bench.spec.n))
+        observation = bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
+        self._rollout = Rollout(bench, observation, many.desired(many.periods + 1), many.loop)  # also after the last
         return self._observe(), {"seed": seeds}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
@@ -119,11 +119,11 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         rollout.advance(Command(self._spaces.command(self._action)))
         lost = rollout.lost()
         failed = np.zeros(self.num_envs, dtype=np.bool_) if lost is None else lost
-        failed[list(many.bench.faults)] = True
-        error = self._spaces.error(many.bench.truth(), rollout.reference[:, 0])
+        failed[list(self._bench.faults)] = True
+        error = self._spaces.error(self._bench.truth(), rollout.reference[:, 0])
         self._ended = not rollout.running or bool(failed.any())
         period = self._spaces.spec.period
-        periods = np.where(failed, many.loop.periods - rollout.k + 1, 1)
+        periods = np.where(failed, many.periods - rollout.k + 1, 1)
         info = {"time": rollout.k * period, "error": error}
         return self._observe(), -error * periods * period, failed, ~failed & self._ended, info
 
@@ -138,5 +138,5 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
         """Free the plant."""
         if self._many is not None:
-            self._many.bench.close()
+            self._many.plant.close()
             self._many = None

@@ -27,14 +27,15 @@ def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Contr
     """Return plant and controller such that each raises `WrongAnswer` where it breaks its contract."""
     kept = isinstance(plant, Bench), isinstance(controller, ServoController)
     spec = plant.spec
-    return plant if kept[0] else _HeldPlant(plant), controller if kept[1] else _HeldController(controller, spec)
+    return plant if kept[0] else HeldPlant(plant), controller if kept[1] else HeldController(controller, spec)
 
 
 @final
-class _HeldController(Controller):
+class HeldController(Controller):
     """A controller whose answers are checked."""
 
     def __init__(self, controller: Controller, spec: PlantSpec) -> None:
+        """Take a controller and the spec of its plant."""
         self._controller, self._spec = controller, spec
 
     def reset(self, observation: Observation, seed: int) -> None:
@@ -81,10 +82,11 @@ class _HeldController(Controller):
 
 
 @final
-class _HeldPlant(Plant):
+class HeldPlant(Plant):
     """A plant whose answers are checked."""
 
     def __init__(self, plant: Plant) -> None:
+        """Take a plant."""
         self._plant, self.spec = plant, plant.spec
 
     def reset(self, seed: int) -> Observation:
@@ -116,7 +118,7 @@ class _HeldPlant(Plant):
         self._plant.close()
 
     def _observation(self, method: Callable[..., Any], signature: str, argument: object) -> Observation:
-        observation, name = _call(method, signature, argument), method.__name__
+        observation, name = _call(method, signature, argument), signature.partition("(")[0]
         if not isinstance(observation, Observation):
             text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
             raise WrongAnswer(f"{text}; write `return Observation(time, joint_position, feature)`", method)

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import pandas as pd
+import numpy as np
+import numpy.typing as npt
 
+from servobench.controllers.servo import ServoController
 from servobench.harness.config.registry import engine_of
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.experiment import Drawn, Experiment, build, draw
-from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos, Together, build_together
+from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw
+from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import judge_run
-from servobench.harness.run.outcome import final_pose_error, find_outcome, pose_errors
+from servobench.harness.run.outcome import final_means, find_outcome, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
-from servobench.harness.run.scenario import Scenario
+from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
@@ -60,14 +62,11 @@ def carry_out(
     With `debug`, an error that is no `RunFault` is raised instead of noted.
     """
     experiment = build(resolved, keep=keep)
-    plant, scenario = experiment.plant, experiment.scenario
-    log = StepLog(plant.spec, experiment.periods)
-    ending = Ending()
+    plant, log, ending = experiment.plant, StepLog(experiment.plant.spec, experiment.periods), Ending()
     try:
         with careful():
-            desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
             pair = held_to_contract(plant, experiment.controller)
-            run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
+            run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
     except BaseException as error:
         if ends_batch(error) or (debug and is_defect(error)):
             raise
@@ -76,18 +75,12 @@ def carry_out(
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
         plant.close()
-    row = _row(experiment.drawn, resolved.request, ending, _numbers(_judge(logged, scenario)), logged)
-    table = _table(experiment, resolved.request, logged) if steps else None
+    pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
+    row = _row(experiment.drawn, resolved.request, ending, _judge(logged, experiment), logged, pose)
+    if not steps:
+        return RunResult(row, None, image, ending.trace)
+    table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(**pose)
     return RunResult(row, table, image, ending.trace)
-
-
-def _table(experiment: Experiment, request: RunRequest, logged: Steps) -> pd.DataFrame:
-    """Return the table of steps, with the true pose error where the sensing set-up is judged by it."""
-    table = logged.table(request.run_id, full_jacobian=experiment.run.full_jacobian)
-    errors = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
-    if errors is not None:
-        table["pose_error_mm"], table["pose_error_deg"] = errors
-    return table
 
 
 def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
@@ -108,46 +101,54 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
 
 def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunResult]:
     """Carry out runs whose logs fit into memory side by side."""
-    many = build_together(runs, keep=keep)
-    ends = Ends(len(runs))
-    log = ManyLogs(many.bench.spec, many.loop.periods, ends)
+    many, ends = build_together(runs, keep), Ends(len(runs))
+    bench, log = cast(Bench, many.plant), ManyLogs(many.plant.spec, many.periods, ends)
     try:
         with careful(), contextlib.suppress(AllEnded):
-            plant, controller = ManyBenches(many.bench, ends), ManyServos(many.servo, ends)
-            run_loop(plant, controller, many.desired, many.loop, [run.request.seed for run in runs], log)
+            servo = ManyServos(cast(ServoController, many.controller).servo, ends)
+            run_loop(
+                ManyBenches(bench, ends), servo, many.desired(), many.loop, [each.request.seed for each in runs], log
+            )
     finally:
-        many.bench.close()
+        bench.close()
     return _judge_together(runs, many, ends, log.steps())
 
 
-def _judge_together(runs: Sequence[ResolvedRun], many: Together, ends: Ends, logged: Steps) -> list[RunResult]:
-    task = many.drawn[0].scenario
-    metrics = _judge(logged, task) if len(ends.running) else {}
+def _judge_together(runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, logged: Steps) -> list[RunResult]:
+    metrics = _judge(logged, many) if len(ends.running) else {}
     columns = {name: values.tolist() for name, values in metrics.items()}
     results = []
-    for lane, (run, drawn) in enumerate(zip(runs, many.drawn, strict=True)):
+    for lane, (run, drawn) in enumerate(zip(runs, many.runs, strict=True)):
+        own = logged.run(lane, ends.rows.get(lane, len(logged)))
         if lane in ends.faults:
-            own = logged.run(lane, ends.rows[lane])
-            ending, values = Ending.of(ends.faults[lane]), _numbers(_judge(own, task))
+            ending, values = Ending.of(ends.faults[lane]), _judge(own, many)
         else:
-            own = logged.run(lane, len(logged))
             ending, values = Ending(), {name: column[lane] for name, column in columns.items()}
-        results.append(RunResult(_row(drawn, run.request, ending, values, own), None, trace=ending.trace))
+        pose = pose_errors(drawn.true, drawn.scenario.reference, own)
+        results.append(RunResult(_row(drawn, run.request, ending, values, own, pose), None, trace=ending.trace))
     return results
 
 
-def _judge(logged: Steps, task: Scenario) -> dict[str, FloatArray]:
+def _judge(logged: Steps, experiment: Experiment) -> dict[str, FloatArray]:
     """Return the metrics of a run or of runs side by side; none without rows."""
+    task = experiment.scenario
     return judge_run(logged, task.kind, task.evaluate_from, task.lap_time) if len(logged) else {}
 
 
-def _numbers(metrics: dict[str, FloatArray]) -> dict[str, float]:
-    return {name: float(value) for name, value in metrics.items()}
-
-
-def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, float], logged: Steps) -> dict[str, Any]:
-    spec, status = logged.spec, ending.status
-    outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
+def _row(
+    drawn: Drawn,
+    request: RunRequest,
+    ending: Ending,
+    metrics: Mapping[str, npt.ArrayLike],
+    logged: Steps,
+    pose: Mapping[str, FloatArray],
+) -> dict[str, Any]:
+    """Return the row of a run in the table of runs."""
+    spec, status, outcome = logged.spec, ending.status, ending.status
+    numbers = {name: float(np.asarray(value)) for name, value in metrics.items()}
+    if status == COMPLETED:
+        times = numbers["settling_time_s"], numbers["rms_error_evaluated"]
+        outcome = find_outcome(logged, drawn.scenario, *times, drawn.final)
     return {
         **identity(request),
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
@@ -156,8 +157,8 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
         "settling_band": spec.feature.band,
         "status": status,
         "outcome": outcome,
-        **metrics,
-        **_pose_metrics(drawn, logged),
+        **numbers,
+        **final_means(pose, spec.period),
         "periods": len(logged),
         "reason": ending.reason,
         "mismatch_values": json.dumps(drawn.as_record()),
@@ -167,14 +168,3 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
 def identity(request: RunRequest) -> dict[str, Any]:
     """Return the columns that are known of a run before it is carried out."""
     return {**request.as_row(), "engine": engine_of(request.plant)}
-
-
-def _pose_metrics(drawn: Drawn, logged: Steps) -> dict[str, float]:
-    """Return the true pose error at the end of a run, where the sensing set-up is judged by it."""
-    errors = pose_errors(drawn.true, drawn.scenario.reference, logged) if len(logged) else None
-    return {} if errors is None else final_pose_error(*errors, logged.spec.period)
-
-
-def _outcome(drawn: Drawn, metrics: dict[str, float], logged: Steps) -> str:
-    times = metrics["settling_time_s"], metrics["rms_error_evaluated"]
-    return find_outcome(logged, drawn.scenario, *times, drawn.final)

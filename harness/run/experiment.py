@@ -8,7 +8,7 @@ run is refused only where no true robot of that mismatch could do it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -36,6 +36,7 @@ from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import PlantSpec
@@ -110,35 +111,56 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A run made ready: all configuration resolved, the true robot drawn, plant and controller built."""
+    """A run made ready, or runs that advance together: true robots drawn, plant and controller built.
+
+    Attributes:
+        plant: of runs that advance together a bench with a lane for each.
+        controller: likewise.
+        runs: the true robot and the task of each run.
+        run: the settings that all of them share.
+        together: whether there are lanes, also for a single run.
+    """
 
     plant: Plant
     controller: Controller
-    drawn: Drawn
+    runs: tuple[Drawn, ...]
     run: RunSettings
+    together: bool = False
+
+    @property
+    def drawn(self) -> Drawn:
+        """The true robot and the task of the run, or of the first run."""
+        return self.runs[0]
 
     @property
     def scenario(self) -> Scenario:
-        """Start, reference and length of the run."""
+        """Start, reference and length of the run, or of the first run."""
         return self.drawn.scenario
-
-    @property
-    def loop(self) -> LoopSettings:
-        """The settings of the loop."""
-        moved = self.drawn.moved
-        return loop_settings(self.run, self.scenario.duration, None if moved is None else moved.camera)
 
     @property
     def periods(self) -> int:
         """Number of control periods."""
         return self.run.periods(self.scenario.duration)
 
+    @property
+    def loop(self) -> LoopSettings:
+        """The settings of the loop, with the camera's pose (..., 4, 4) after a move."""
+        run, periods = self.run, self.periods
+        moved = [each.moved.camera for each in self.runs if each.moved is not None]
+        move = CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
+        return LoopSettings(periods, run.preview_rows, run.lost_after_periods, move)
 
-def loop_settings(run: RunSettings, duration: float, moved: FloatArray | None) -> LoopSettings:
-    """Return the settings of the loop of a run of `duration` [s], with the camera's pose (..., 4, 4) after a move."""
-    periods = run.periods(duration)
-    move = None if moved is None else CameraMove(int(run.camera_moves_at * periods), moved)
-    return LoopSettings(periods, run.preview_rows, run.lost_after_periods, move)
+    def desired(self, periods: int | None = None) -> FloatArray:
+        """Return the desired features of the run, or of so many periods, and beyond them those that are previewed.
+
+        Returns:
+            (..., periods + preview, m) [unit of the feature].
+        """
+        rows = (self.periods if periods is None else periods) + self.run.preview_rows
+        return self._in_lanes([each.scenario.reference.sampled(self.plant.spec.period, rows) for each in self.runs])
+
+    def _in_lanes(self, arrays: list[FloatArray]) -> FloatArray:
+        return np.stack(arrays) if self.together else arrays[0]
 
 
 def build_experiment(
@@ -159,49 +181,73 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    entry = find_plant(resolved.request.plant)
-    if entry.own_robot:
-        return _build_with_own_robot(resolved, entry, keep, progress)
-    drawn = draw(resolved)
-    return Experiment(*assemble(resolved, drawn.true, drawn.scenario.start, keep, progress), drawn, resolved.run)
+    request = resolved.request
+    if not find_plant(request.plant).own_robot:
+        drawn = draw(resolved)
+        pair = _assemble(resolved, drawn.true, drawn.scenario.start, keep, progress)
+        return Experiment(*pair, (drawn,), resolved.run)
+    if request.mismatch != Mismatch():
+        raise ConfigurationError(
+            f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
+        )
+    if request.sensing != DEFAULT_SENSING:
+        raise ConfigurationError(
+            f"plant {request.plant} brings a sensor of its own, so --sensing {request.sensing} does not apply"
+        )
+    plant, controller = _assemble(resolved, None, None, keep, progress)
+    try:
+        setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
+        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run)
+    except BaseException:
+        plant.close()
+        raise
 
 
-def assemble(
+def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Experiment:
+    """Make runs of one `lanes.side_by_side_key` ready, with a lane for each.
+
+    Raises:
+        Exception: any error of a run alone, or runs that cannot advance together.
+    """
+    first, drawn = runs[0], tuple(map(draw, runs))
+    robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
+    return Experiment(*_assemble(first, robots, starts, keep, None), drawn, first.run, together=True)
+
+
+def _assemble(
     resolved: ResolvedRun,
     true: RobotModel | None,
     start: FloatArray | None,
-    keep: Path | None = None,
-    progress: Progress | None = None,
+    keep: Path | None,
+    progress: Progress | None,
 ) -> tuple[Plant, Controller]:
-    """Return plant and controller for a true robot and a start, or for those of runs side by side.
+    """Return plant and controller for a true robot and a start (..., n) [rad]; for None the plant brings its own.
 
-    Args:
-        resolved: the run, or one of the runs.
-        true: the robot; of runs side by side its arrays have a leading axis.
-        start: (..., n) [rad].
-        keep: results folder in which trained networks are kept beside the runs.
-        progress: called with the share of a training of networks that is done.
+    Of runs side by side the arrays of the robot have a leading axis, and `resolved` is one of them.
 
     Raises:
         ConfigurationError: a setting that cannot be used.
     """
-    request, run = resolved.request, resolved.run
-    robot, entry = find_robot(request.robot), find_plant(request.plant)
+    request, run, entry = resolved.request, resolved.run, find_plant(resolved.request.plant)
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
         raise ConfigurationError(f"plant {entry.name} has the sensing position only, got --sensing {request.sensing}")
-    nominal = find_sensing(request.sensing).nominal(robot)
+    robot = None if entry.own_robot else find_robot(request.robot)
     plant = _build_plant(resolved, entry, PlantSetup(true, start, run.period, robot))
     try:
-        knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
-        if robot.known:
-            knowledge = replace(knowledge, train=trained_on(in_view(knowledge, nominal, robot), keep, progress))
-        controller = _build_controller(
-            request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
-        )
+        if robot is None:
+            knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
+            trains = knowledge if knowledge.nominal_jacobian is not None else None
+        else:
+            nominal = find_sensing(request.sensing).nominal(robot)
+            knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
+            trains = in_view(knowledge, nominal, robot) if robot.known else None
+        if trains is not None:
+            knowledge = replace(knowledge, train=trained_on(trains, keep, progress))
+        true_model = plant.true_model if robot is None else lambda: plant.with_delays(_equations(true))
+        return plant, _build_controller(request.controller, resolved.controller, knowledge, true_model)
     except BaseException:
         plant.close()
         raise
-    return plant, controller
 
 
 def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
@@ -267,35 +313,6 @@ def train_networks(
     if not trained:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return trained[-1]
-
-
-def _build_with_own_robot(
-    resolved: ResolvedRun, entry: PlantEntry, keep: Path | None, progress: Progress | None
-) -> Experiment:
-    """Make a run ready on a plant of whose robot only the plant itself knows anything."""
-    request, run = resolved.request, resolved.run
-    if request.mismatch != Mismatch():
-        raise ConfigurationError(
-            f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
-        )
-    if request.sensing != DEFAULT_SENSING:
-        raise ConfigurationError(
-            f"plant {request.plant} brings a sensor of its own, so --sensing {request.sensing} does not apply"
-        )
-    plant = _build_plant(resolved, entry, PlantSetup(None, None, run.period))
-    try:
-        spec = plant.spec
-        setting = TaskSetting(None, spec.n, spec.feature, named_seed(request.seed, "task"))
-        scenario = build_scenario(resolved, setting)
-        nominal = plant.nominal_jacobian()
-        knowledge = RobotKnowledge(spec, run.preview_rows, nominal)
-        if nominal is not None:
-            knowledge = replace(knowledge, train=trained_on(knowledge, keep, progress))
-        controller = _build_controller(request.controller, resolved.controller, knowledge, plant.true_model)
-    except BaseException:
-        plant.close()
-        raise
-    return Experiment(plant, controller, Drawn(scenario), run)
 
 
 def _equations(model: RobotModel | None) -> TrueModel:

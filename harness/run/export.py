@@ -162,8 +162,7 @@ def _run(experiment: Experiment) -> ControllerRun:
 def _begin(experiment: Experiment) -> Rollout:
     """Return the run at its first instant, with seed 0 and without the camera's move and the end by lost features."""
     length = LoopSettings(experiment.periods, experiment.run.preview_rows)
-    desired = experiment.scenario.reference.sampled(experiment.plant.spec.period, length.periods + length.preview)
-    return begin(experiment.plant, experiment.controller, desired, length, (0, 0))
+    return begin(experiment.plant, experiment.controller, experiment.desired(), length, (0, 0))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:

@@ -8,26 +8,22 @@ until the failing run is found.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, cast, final
+from collections.abc import Hashable
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.controller import Controller, Diagnostics
-from servobench.controllers.servo import Servo, ServoController, ServoState
+from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.run.experiment import Drawn, assemble, draw, loop_settings
 from servobench.harness.run.log import StepLog, Steps
-from servobench.harness.run.loop import LoopSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import stack, take
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+from servobench.plant.contract.lanes import Tree, map_arrays, take
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 LaneIndex = npt.NDArray[np.intp]
 
@@ -64,13 +60,16 @@ class Ends:
         if not len(self.running):
             raise AllEnded
 
-    def spread(self, values: npt.NDArray[Any], before: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return values of the runs under way in their places among all runs; the others keep those from before."""
-        if len(self.running) == self.count:
-            return values
-        spread = before.copy()
-        spread[self.running] = values
-        return spread
+    def spread(self, tree: Tree, before: Tree) -> Tree:
+        """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
+
+        def placed(values: npt.NDArray[Any], old: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            spread = old.copy()
+            spread[self.running] = values
+            return spread
+
+        all_lanes: Tree = tree if len(self.running) == self.count else map_arrays(placed, tree, before)
+        return all_lanes
 
 
 class _Member:
@@ -108,29 +107,21 @@ class ManyBenches(Plant):
         """See `Plant.step`; a run whose plant fails ends."""
         self._leave()
         if len(self._ends.running) < self._ends.count:
-            command = Command(take(command.joint_velocity, self._ends.running))
-        observation = self._bench.step(command)
-        faults = self._bench.faults
-        if faults:
-            lanes = self._ends.running
-            for lane, fault in faults.items():
-                self._ends.end(int(lanes[lane]), fault, self._k)
-            stay = self._member.left()
-            if stay is not None:
-                self._bench.keep(stay)
-                observation = take(observation, stay)
+            command = take(command, self._ends.running)
+        observation, lanes = self._bench.step(command), self._ends.running
+        for lane, fault in self._bench.faults.items():
+            self._ends.end(int(lanes[lane]), fault, self._k)
+        stay = self._leave()
+        if stay is not None:
+            observation = take(observation, stay)
         self._k += 1
-        self._last = self._spread(observation)
+        self._last = self._ends.spread(observation, self._last)
         return self._last
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
         self._leave()
-        truth, last = self._bench.truth(), self._truth
-        jacobian = truth.jacobian
-        if jacobian is not None and last.jacobian is not None:
-            jacobian = self._ends.spread(jacobian, last.jacobian)
-        self._truth = Truth(self._ends.spread(truth.feature, last.feature), jacobian)
+        self._truth = self._ends.spread(self._bench.truth(), self._truth)
         return self._truth
 
     def move_camera(self, X_BC: FloatArray) -> None:
@@ -142,15 +133,12 @@ class ManyBenches(Plant):
         """See `Plant.close`."""
         self._bench.close()
 
-    def _leave(self) -> None:
+    def _leave(self) -> LaneIndex | None:
+        """Let runs that ended leave the bench; return which of its lanes stay, or None if all do."""
         stay = self._member.left()
         if stay is not None:
             self._bench.keep(stay)
-
-    def _spread(self, observation: Observation) -> Observation:
-        names = ("joint_position", "feature", "feature_valid", "valid")
-        arrays = [self._ends.spread(getattr(observation, name), getattr(self._last, name)) for name in names]
-        return trusted_observation(observation.time, *arrays)
+        return stay
 
 
 @final
@@ -245,17 +233,6 @@ class ManyLogs(StepLog):
         return super().steps()
 
 
-@dataclass(frozen=True, eq=False)
-class Together:
-    """Runs made ready: plant, controller and reference with a lane for each."""
-
-    bench: Bench
-    servo: Servo
-    drawn: tuple[Drawn, ...]  # the true robot and the task of each run
-    desired: FloatArray  # (B, periods + preview, m) [unit of the feature]
-    loop: LoopSettings
-
-
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
     request = run.request
@@ -264,19 +241,3 @@ def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, moved, request.robot, request.sensing
     return (*names, *map(id, (run.run, run.plant, run.controller, run.task)))
-
-
-def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:
-    """Make runs of one `side_by_side_key` ready.
-
-    Raises:
-        Exception: any error of a run alone, or runs that cannot advance together.
-    """
-    first, drawn = runs[0], tuple(draw(run) for run in runs)
-    moved = [each.moved.camera for each in drawn if each.moved is not None]
-    loop = loop_settings(first.run, drawn[0].scenario.duration, np.stack(moved) if moved else None)
-    rows = loop.periods + loop.preview
-    desired = np.stack([each.scenario.reference.sampled(first.run.period, rows) for each in drawn])
-    robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
-    plant, controller = assemble(first, robots, starts, keep)
-    return Together(cast(Bench, plant), cast(ServoController, controller).servo, drawn, desired, loop)

@@ -17,6 +17,7 @@ reach drives joints to their stops, not the other way round. The band of a curve
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -84,27 +85,26 @@ def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, ba
     return bool((closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper) > band).any())
 
 
-def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
-    """Return distance (k,) [mm] and angle (k,) [deg] of the target from its reference pose; None where not judged.
+def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> dict[str, FloatArray]:
+    """Return distance and angle of the target from its reference pose, (k,), as columns; none where not judged.
 
     Where the camera is moved during the run, the target is still judged by its taught pose.
     """
     if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, ImageReference)):
-        return None
+        return {}
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
-    return 1e3 * distance, np.degrees(angle)
+    return {"pose_error_mm": 1e3 * distance, "pose_error_deg": np.degrees(angle)}
 
 
-def final_pose_error(distance: FloatArray, angle: FloatArray, period: float) -> dict[str, float]:
-    """Return the means of the last second as columns of the table of runs.
+def final_means(columns: Mapping[str, FloatArray], period: float) -> dict[str, float]:
+    """Return the means of columns (k,) over the last second; none without rows.
 
     Args:
-        distance: (k,) [mm].
-        angle: (k,) [deg].
+        columns: by name.
         period: of control [s].
     """
     rows = max(1, round(FINAL_SPAN / period))
-    return {"pose_error_mm": float(distance[-rows:].mean()), "pose_error_deg": float(angle[-rows:].mean())}
+    return {name: float(values[-rows:].mean()) for name, values in columns.items() if len(values)}
 
 
 def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:

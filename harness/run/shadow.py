@@ -104,7 +104,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         plant = LoggedPlant(spec, table)
         log = StepLog(spec, len(table))
         loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
-        desired = experiment.scenario.reference.sampled(spec.period, loop.periods + loop.preview)
+        desired = experiment.desired(loop.periods)
         logged = _columns(table, feature_columns(spec, "reference"))
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])

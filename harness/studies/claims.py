@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -37,6 +37,7 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
     success_rate,
 )
+from servobench.harness.batch.campaign import Campaign
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import Settings
@@ -127,15 +128,6 @@ class Answer:
         return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
 
 
-class Study(NamedTuple):
-    """Runs with common settings."""
-
-    name: str  # of its folder
-    settings: Settings  # overrides of the defaults
-    cells: tuple[Cell, ...]  # the runs
-    timed: bool = False  # each run goes by itself, so that its steps have times
-
-
 def find_divisions(text: str) -> tuple[str, ...]:
     """Return the divisions that a user named: `equipped`, `published` or `both`.
 
@@ -155,8 +147,8 @@ def plain_names(division: str) -> dict[str, str]:
     return {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
 
 
-def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> list[Study]:
-    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle.
+def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> dict[str, Campaign]:
+    """Return the studies by name on `plants`: `seeds` robots for each move, two fifths of them for the circle.
 
     Args:
         plants: names.
@@ -174,14 +166,16 @@ def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") 
         return tuple(Cell(request) for request in batch.requests())
 
     four = (PROPOSED, *OTHERS)
-    main = Study(MAIN, Settings(rendered), cells(four, MOVES, robots) + cells(four, (CIRCLE,), some))
     own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
     both = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
-    return [
-        main,
-        Study(TIMED, Settings(rendered), both, timed=True),
-        *(Study(name, Settings({**rendered, PROPOSED + suffix: reading}), own) for name, reading in READINGS.items()),
-    ]
+    return {
+        MAIN: Campaign(cells(four, MOVES, robots) + cells(four, (CIRCLE,), some), Settings(rendered)),
+        TIMED: Campaign(both, Settings(rendered), timed=True),
+        **{
+            name: Campaign(own, Settings({**rendered, PROPOSED + suffix: reading}))
+            for name, reading in READINGS.items()
+        },
+    }
 
 
 def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> list[Answer]:

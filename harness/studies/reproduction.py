@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
@@ -57,15 +57,11 @@ def reproduce(
         raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
     answers, main = [], {}
     for division in divisions:
-        tables = {}
-        for study in studies(plants, robots, division):
-            folder = out / division.replace(" ", "_") / study.name
-            own = replace(how.of_part(folder), block=1 if study.timed else how.block)
-            carry_out(Campaign(study.cells, study.settings), folder, own)
-            tables[study.name] = results.load_runs(folder)
+        folder = out / division.replace(" ", "_")
+        tables = carry_out_parts(studies(plants, robots, division), folder, how)
         answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
         main[division] = tables[MAIN]
-        manifest = results.read_manifest(folder.parent / MAIN)
+        manifest = results.read_manifest(folder / MAIN)
     answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
     results.write_summary(out, main, manifest)
     write_tables(answers, out)

@@ -21,7 +21,7 @@ from servobench.harness.analysis.comparison import settled_share, settling_band,
 from servobench.harness.analysis.loops.loop_analysis import latency_border
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
@@ -160,12 +160,10 @@ def make_map(
     check_settings(settings, [plant, TASK, *controllers])
     settings = Settings(settings.sections)  # each part reads some of them
     static, moved = map_cells(plant, controllers, seeds, robot, lines, sensing)
-    parts = {STATIC_CAMERA: (static, settings), MOVED_CAMERA: (moved, moved_settings(settings))}
-    made = [name for name, (cells, _) in parts.items() if len(cells)]
-    for name in made:
-        folder, (cells, chosen) = out / name, parts[name]
-        carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
-    results.write_summary(out, map_tables(out), results.read_manifest(out / made[0]))
+    parts = {STATIC_CAMERA: Campaign(static, settings), MOVED_CAMERA: Campaign(moved, moved_settings(settings))}
+    made = {name: campaign for name, campaign in parts.items() if len(campaign.cells)}
+    carry_out_parts(made, out, how)
+    results.write_summary(out, map_tables(out), results.read_manifest(out / next(iter(made))))
     limits: dict[str, float] = {}
     if any(line.axis == LATENCY for line in lines) and sensing == DEFAULT_SENSING and plant not in RENDERED:
         limits = predicted_limits(controllers, settings, robot)
@@ -221,14 +219,12 @@ def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    if not (folder / MOVED_CAMERA).exists():
-        return {STATIC_CAMERA: results.load_runs(folder / STATIC_CAMERA)}
-    moved = results.load_runs(folder / MOVED_CAMERA)
-    configuration = results.read_manifest(folder / MOVED_CAMERA)["configuration"]
-    moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
-    tables = {MOVED_CAMERA: moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment))}
-    if (folder / STATIC_CAMERA).exists():
-        tables = {STATIC_CAMERA: results.load_runs(folder / STATIC_CAMERA), **tables}
+    parts = [name for name in (STATIC_CAMERA, MOVED_CAMERA) if (folder / name).exists()]
+    tables = {name: results.load_runs(folder / name) for name in parts}
+    if (moved := tables.get(MOVED_CAMERA)) is not None:
+        configuration = results.read_manifest(folder / MOVED_CAMERA)["configuration"]
+        moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
+        tables[MOVED_CAMERA] = moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment))
     return tables
 
 

@@ -204,7 +204,9 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
     assert {answer.division for answer in answers} == {"as published"}
     usual = answer_all(tables(settling_time_s=proposed(-0.5)), "kinematic")
     assert [(a.verdict, a.evidence) for a in answers] == [(a.verdict, a.evidence) for a in usual]
-    names = {cell.request.controller for study in studies(["kinematic"], 6, "as published") for cell in study.cells}
+    names = {
+        cell.request.controller for study in studies(["kinematic"], 6, "as published").values() for cell in study.cells
+    }
     assert names == {f"{name}:published" for name in METHODS}
 
 
@@ -218,7 +220,7 @@ def test_every_answer_is_in_the_tables_and_has_a_figure(tmp_path):
 
 
 def test_no_study_uses_a_seed_that_methods_were_tuned_on():
-    for study in studies(["kinematic"], 400):
+    for study in studies(["kinematic"], 400).values():
         seeds = {cell.request.seed for cell in study.cells}
         assert not seeds & set(TUNING)
         assert min(seeds) == FIRST_SEED

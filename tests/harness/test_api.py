@@ -14,7 +14,7 @@ import pytest
 import servobench
 from kit.command import PACKAGE, judged
 from kit.resting import Resting
-from servobench.harness.config.adapters import NoSettings
+from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}

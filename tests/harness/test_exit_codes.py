@@ -15,8 +15,7 @@ from kit.command import PACKAGE, servobench
 from kit.resting import Resting
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.config.adapters import NoSettings
-from servobench.harness.config.entries import CONTROLLER, own_object
+from servobench.harness.config.entries import CONTROLLER, NoSettings, own_object
 from servobench.harness.config.registry import offering
 
 

@@ -76,7 +76,6 @@ time.sleep(60)
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_processes_below_one_are_found_with_their_memory():
     with subprocess.Popen([sys.executable, "-S", "-c", FAMILY], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
@@ -106,7 +105,6 @@ print(processes.descendants(os.getpid()))
 """
 
 
-@pytest.mark.skipif(not processes.LINUX, reason="only Linux lets a process adopt what is orphaned below it")
 def test_a_process_that_left_its_session_and_its_parent_is_ended_all_the_same():
     began = time.monotonic()
     done = subprocess.run([sys.executable, "-c", ADOPTED], capture_output=True, text=True, check=True, timeout=50)

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from kit.command import PACKAGE
-from servobench.harness.batch import processes, sandbox
+from servobench.harness.batch import sandbox
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
 from servobench.plant.contract.faults import ConfigurationError
@@ -58,7 +58,6 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not processes.LINUX, reason="only Linux tells a process that its parent has ended")
 def test_a_guard_that_is_stopped_ends_with_the_process_that_started_it(tmp_path):
     (tmp_path / "killed.py").write_text(STOPPED)
     path = {**os.environ, "PYTHONPATH": str(PACKAGE)}

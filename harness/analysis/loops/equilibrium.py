@@ -76,8 +76,7 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
     experiment, seed = build(resolved), resolved.request.seed
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
     length = LoopSettings(run.periods(duration), run.preview_rows)
-    desired = experiment.scenario.reference.sampled(plant.spec.period, length.periods + length.preview)
-    rollout = begin(plant, controller, desired, length, (seed, seed))
+    rollout = begin(plant, controller, experiment.desired(length.periods), length, (seed, seed))
     for _ in periods(rollout, controller):
         pass
     observation, truth, model = rollout.observation, plant.truth(), experiment.drawn.true
