@@ -48,12 +48,12 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Hand a file with a mark `xdist_group` to one process: pytest 9.2 drops what pytest-xdist 3.8 adds to names."""
+    """Hand a file whose tests share a fixture to one process, and all others test by test."""
     from xdist.scheduler import LoadGroupScheduling
 
     @cache
     def is_group(path: str) -> bool:
-        return "mark.xdist_group(" in (config.rootpath / path).read_text(encoding="utf-8")
+        return 'scope="module"' in (config.rootpath / path).read_text(encoding="utf-8")
 
     class ByGroup(LoadGroupScheduling):
         def _split_scope(self, nodeid: str) -> str:

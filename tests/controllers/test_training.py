@@ -25,8 +25,6 @@ from servobench.controllers.networks.fit import (
 )
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 
-pytestmark = pytest.mark.xdist_group("training")  # one process makes what these tests share
-
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid")]
 N, M = 3, 2
 SPEC = plant_spec(N, M)

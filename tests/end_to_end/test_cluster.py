@@ -20,8 +20,6 @@ from servobench.plant.contract.faults import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
-pytestmark = pytest.mark.xdist_group("cluster")  # one process makes what these tests share
-
 SWEEP = ("sweep", "--controllers", "broyden,rls", "--seeds", "300", "--set", "random.duration=4")
 RUNS = 600  # six blocks: the first is there long before the last
 

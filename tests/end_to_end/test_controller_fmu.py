@@ -20,8 +20,6 @@ from servobench.harness.run import export as controller_fmu
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = pytest.mark.xdist_group("controller_fmu")  # one process makes what these tests share
-
 PERIOD, N, M = 0.05, 6, 3
 METHODS = ["ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbfnn_mfac"]
 INPUTS = 0  # value reference of the first input

@@ -16,8 +16,6 @@ from kit.command import finish, judged, left_behind, part_count, servobench, sta
 from night import hostile_controllers
 from servobench.harness.batch import results
 
-pytestmark = pytest.mark.xdist_group("isolation")  # one process makes what these tests share
-
 HOSTILE = Path(hostile_controllers.__file__)
 MARK = "SERVOBENCH_TEST_MARK"  # an environment variable that all processes of a command inherit
 SOON = 5.0  # [s] until nothing is left of a command that was ended
