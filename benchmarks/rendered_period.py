@@ -22,7 +22,7 @@ from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.detection import Window, whole, window_around
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
-from servobench.plant.rendered.plants import build_bullet, build_mujoco
+from servobench.plant.rendered.plants import BULLET, MUJOCO
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
@@ -44,7 +44,7 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
 
     from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 
-    plant = opened.enter_context(closing(build_bullet(config, PlantSetup(MODEL, HOME, PERIOD))))
+    plant = opened.enter_context(closing(BULLET.build(config, PlantSetup(MODEL, HOME, PERIOD))))
     scenes = [opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery, ROBOT)))) for _ in range(2)]
     stops = np.full(6, np.pi)
     machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))
@@ -53,12 +53,12 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     plant.reset(0)
     for scene in scenes:
         scene.place(HOME)
-    plain, plain_arm = scenes[1]._client, scenes[1]._arm
+    plain, plain_arm = scenes[1]._world.client, scenes[1]._arm
     pybullet.setPhysicsEngineParameter(fixedTimeStep=PHYSICS_STEP, physicsClientId=plain)
     matrices = [each.T.ravel().tolist() for each in (view_matrix(MODEL.X_BC), camera.projection_matrix())]
 
     def bare(_: FloatArray) -> None:
-        client, arm, theta, rest = mechanics._client, mechanics._arm, list(ur5.HOME), [0.0] * 6
+        client, arm, theta, rest = mechanics._world.client, mechanics._arm, list(ur5.HOME), [0.0] * 6
         for step in range(STEPS):
             pybullet.calculateMassMatrix(arm, theta, physicsClientId=client)
             for _ in range(2):
@@ -96,7 +96,7 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     """Return the calls of MuJoCo, with the whole image and with the ball's window, and those of the plant."""
     from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation, mujoco
 
-    plant = opened.enter_context(closing(build_mujoco(config, PlantSetup(MODEL, HOME, PERIOD))))
+    plant = opened.enter_context(closing(MUJOCO.build(config, PlantSetup(MODEL, HOME, PERIOD))))
     plant.reset(0)
     stops = np.full(6, config.joint_range)
     machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from servobench.fmus.model_description import Description, sampled_sections
 from servobench.fmus.product import Product, c_files, documentation, tool, word
-from servobench.fmus.reference import table
+from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.sources import generated_source
 from servobench.fmus.trace.branches import NOT_DEFINITE
 from servobench.fmus.trace.record import Recorded
@@ -44,26 +44,6 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
 
 
 @dataclass(frozen=True)
-class ControllerRun:
-    """A run of the original controller: its inputs and outputs in each period.
-
-    Attributes:
-        time: (K,), s.
-        inputs: by name, (K, size).
-        outputs: by name, (K, size).
-    """
-
-    time: FloatArray
-    inputs: Mapping[str, FloatArray]
-    outputs: Mapping[str, FloatArray]
-
-    def tables(self, layout: Layout) -> tuple[str, str]:
-        """Return inputs and outputs as CSV; the outputs at an instant, before its inputs, are those of the last one."""
-        before = {name: np.vstack([np.zeros(rows.shape[1]), rows[:-1]]) for name, rows in self.outputs.items()}
-        return table(self.time, self.inputs, layout), table(self.time, before, layout)
-
-
-@dataclass(frozen=True)
 class ControllerModel:
     """A controller ready for export.
 
@@ -73,7 +53,7 @@ class ControllerModel:
         recorded: its step, of the columns [time, inputs].
         groups: from `controller_groups`.
         period: s.
-        run: of the original.
+        run: of the original, with its outputs for the inputs at the same time.
         settings: of the original, for the documentation.
     """
 
@@ -82,7 +62,7 @@ class ControllerModel:
     recorded: Recorded
     groups: tuple[Group, ...]
     period: float
-    run: ControllerRun
+    run: ReferenceRun
     settings: str
 
     @property
@@ -123,7 +103,7 @@ class ControllerModel:
                 exchange=False,
             ),
             documentation=self._documentation(layout),
-            reference=self.run.tables(layout),
+            reference=self._reference(layout),
         )
 
     def _constants(self, layout: Layout) -> dict[str, float]:
@@ -139,6 +119,12 @@ class ControllerModel:
             "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
             "FAULT_NOT_DEFINITE": NOT_DEFINITE,
         }
+
+    def _reference(self, layout: Layout) -> tuple[str, str]:
+        """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
+        outputs = self.run.outputs
+        before = {name: np.vstack([np.zeros(rows.shape[1]), rows[:-1]]) for name, rows in outputs.items()}
+        return replace(self.run, outputs=before).tables(layout)
 
     def _documentation(self, layout: Layout) -> str:
         return documentation(

@@ -5,16 +5,16 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-import casadi
 import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections
 from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
-from servobench.fmus.reference import COMMAND, reference_run, table
+from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import SetupModel
@@ -121,7 +121,7 @@ def fingerprint(options: ExportOptions) -> str:
     numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [tool(), casadi.__version__, CODE, options.platforms, options.fmi_version]
+    parts: list[object] = [tool(), version("casadi"), CODE, options.platforms, options.fmi_version]
     parts += [options.title, options.identifier, options.summary]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]
@@ -146,7 +146,6 @@ def product(options: ExportOptions) -> Product:
         sources=c_files(options.fmi_version, CORE),
         tool=tool(),
     )
-    run = reference_run(options.model, options.actuation)
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
@@ -155,7 +154,7 @@ def product(options: ExportOptions) -> Product:
         constants=arm_constants(layout),
         description=description,
         documentation=_documentation(layout, options),
-        reference=(table(run.time, {COMMAND: run.command}, layout), table(run.time, run.outputs, layout)),
+        reference=reference_run(options.model, options.actuation).tables(layout),
     )
 
 

@@ -165,65 +165,57 @@ class Description:
         return {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(self.step)}
 
 
-def write_fmi2(description: Description, token: str) -> bytes:
-    """Return modelDescription.xml of FMI 2.0 with the GUID `token`."""
-    root = ET.Element("fmiModelDescription", fmiVersion="2.0", modelName=description.model_name, guid=token)
-    _describe(root, description)
-    indicators = description.layout.of_role(INDICATOR)
-    root.attrib["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
-    capabilities = {
-        "modelIdentifier": description.model_identifier,
-        "canNotUseMemoryManagementFunctions": "true",
-        "canGetAndSetFMUstate": "true",
-        "canSerializeFMUstate": "true",
-        "providesDirectionalDerivative": "true" if description.exchange else "false",
-    }
+def write_description(description: Description, version: int, token: str) -> bytes:
+    """Return modelDescription.xml of FMI 2.0 or 3.0 with its GUID or instantiation token."""
+    root = ET.Element("fmiModelDescription", fmiVersion=f"{version}.0", modelName=description.model_name)
+    root.attrib["guid" if version == 2 else "instantiationToken"] = token
+    root.attrib["description"] = description.summary
+    root.attrib["generationTool"] = description.tool
+    root.attrib["license"] = "BSD-3-Clause"
+    root.attrib["variableNamingConvention"] = "structured"
+    if version == 2:
+        indicators = description.layout.of_role(INDICATOR)
+        root.attrib["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
+    _interfaces(root, description, version)
+    _units(root, {group.unit for group in description.layout.groups})
+    _log_categories(root)
+    ET.SubElement(root, "DefaultExperiment", description.experiment)
+    variables = ET.SubElement(root, "ModelVariables")
+    (_scalar_variables if version == 2 else _array_variables)(variables, description)
+    structure = ET.SubElement(root, "ModelStructure")
+    for section in description.sections:
+        if version == 3:
+            for reference, dependencies in section.arrays():
+                ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
+        elif section.fmi2:
+            element = ET.SubElement(structure, section.fmi2)
+            for index, dependencies in section.scalars():
+                attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
+                ET.SubElement(element, "Unknown", attributes)
+    return _bytes(root)
+
+
+def _interfaces(root: ET.Element, description: Description, version: int) -> None:
+    """Add model exchange, if there is one, and co-simulation with their capabilities."""
+    derivatives, state = str(description.exchange).lower(), "FMUstate" if version == 2 else "FMUState"
+    capabilities = {"modelIdentifier": description.model_identifier}
+    if version == 2:
+        capabilities["canNotUseMemoryManagementFunctions"] = "true"
+    capabilities |= {f"canGetAndSet{state}": "true", f"canSerialize{state}": "true"}
+    if version == 2:
+        capabilities["providesDirectionalDerivative"] = derivatives
+    else:
+        capabilities |= dict.fromkeys(("providesDirectionalDerivatives", "providesAdjointDerivatives"), derivatives)
     interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
     if description.exchange:
-        interfaces = {"ModelExchange": {"completedIntegratorStepNotNeeded": "true"}, **interfaces}
-    for interface, more in interfaces.items():
-        files = ET.SubElement(ET.SubElement(root, interface, {**capabilities, **more}), "SourceFiles")
-        for name in description.sources:
-            ET.SubElement(files, "File", name=name)
-    _units(root, {group.unit for group in description.layout.groups})
-    _log_categories(root)
-    ET.SubElement(root, "DefaultExperiment", description.experiment)
-    _scalar_variables(ET.SubElement(root, "ModelVariables"), description)
-    structure = ET.SubElement(root, "ModelStructure")
-    for section in description.sections:
-        if not section.fmi2:
-            continue
-        element = ET.SubElement(structure, section.fmi2)
-        for index, dependencies in section.scalars():
-            attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
-            ET.SubElement(element, "Unknown", attributes)
-    return _bytes(root)
-
-
-def write_fmi3(description: Description, token: str) -> bytes:
-    """Return modelDescription.xml of FMI 3.0 with the instantiation token `token`."""
-    root = ET.Element("fmiModelDescription", fmiVersion="3.0", modelName=description.model_name)
-    root.attrib["instantiationToken"] = token
-    _describe(root, description)
-    capabilities = {
-        "modelIdentifier": description.model_identifier,
-        "canGetAndSetFMUState": "true",
-        "canSerializeFMUState": "true",
-        "providesDirectionalDerivatives": "true" if description.exchange else "false",
-        "providesAdjointDerivatives": "true" if description.exchange else "false",
-    }
-    if description.exchange:
-        ET.SubElement(root, "ModelExchange", capabilities)
-    ET.SubElement(root, "CoSimulation", capabilities, canHandleVariableCommunicationStepSize="true")
-    _units(root, {group.unit for group in description.layout.groups})
-    _log_categories(root)
-    ET.SubElement(root, "DefaultExperiment", description.experiment)
-    _array_variables(ET.SubElement(root, "ModelVariables"), description)
-    structure = ET.SubElement(root, "ModelStructure")
-    for section in description.sections:
-        for reference, dependencies in section.arrays():
-            ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
-    return _bytes(root)
+        own = {"completedIntegratorStepNotNeeded": "true"} if version == 2 else {}
+        interfaces = {"ModelExchange": own, **interfaces}
+    for name, more in interfaces.items():
+        interface = ET.SubElement(root, name, {**capabilities, **more})
+        if version == 2:
+            files = ET.SubElement(interface, "SourceFiles")
+            for source in description.sources:
+                ET.SubElement(files, "File", name=source)
 
 
 def write_build_description(description: Description) -> bytes:
@@ -255,13 +247,6 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     for source, role, text in files:
         ET.SubElement(root, "Related", type="text/csv", source=source, role=role, description=text)
     return _bytes(root)
-
-
-def _describe(root: ET.Element, description: Description) -> None:
-    root.attrib["description"] = description.summary
-    root.attrib["generationTool"] = description.tool
-    root.attrib["license"] = "BSD-3-Clause"
-    root.attrib["variableNamingConvention"] = "structured"
 
 
 def _units(root: ET.Element, used: set[str]) -> None:

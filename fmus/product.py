@@ -24,8 +24,7 @@ from servobench.fmus.model_description import (
     REFERENCES,
     Description,
     write_build_description,
-    write_fmi2,
-    write_fmi3,
+    write_description,
     write_references,
 )
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
@@ -97,12 +96,10 @@ class Product:
 
     def descriptions(self, token: str) -> dict[str, bytes]:
         """Return the XML files by their path in the archive."""
-        if self.fmi_version == 2:
-            return {"modelDescription.xml": write_fmi2(self.description, token)}
-        return {
-            "modelDescription.xml": write_fmi3(self.description, token),
-            "sources/buildDescription.xml": write_build_description(self.description),
-        }
+        files = {"modelDescription.xml": write_description(self.description, self.fmi_version, token)}
+        if self.fmi_version == 3:
+            files["sources/buildDescription.xml"] = write_build_description(self.description)
+        return files
 
     def companions(self) -> dict[str, str]:
         """Return documentation, licence and reference run by their path in the archive."""

@@ -25,17 +25,21 @@ COMMAND = "joint_velocity_command"
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """Commands, each held over the step that begins at its time, and the outputs at those times.
+    """Inputs, each held over the step that begins at its time, and the outputs at those times.
 
     Attributes:
         time: (k,), s.
-        command: (k, n), rad/s.
+        inputs: by name, (k, size).
         outputs: by name, (k, size).
     """
 
     time: FloatArray
-    command: FloatArray
-    outputs: dict[str, FloatArray]
+    inputs: Mapping[str, FloatArray]
+    outputs: Mapping[str, FloatArray]
+
+    def tables(self, layout: Layout) -> tuple[str, str]:
+        """Return inputs and outputs as CSV."""
+        return table(self.time, self.inputs, layout), table(self.time, self.outputs, layout)
 
 
 def reference_run(model: RobotModel, actuation: Actuation) -> ReferenceRun:
@@ -62,7 +66,7 @@ def reference_run(model: RobotModel, actuation: Actuation) -> ReferenceRun:
         **_features(model, positions),
         "encoder_position": np.where(resolution > 0.0, np.round(positions / steps) * steps, positions),
     }
-    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
+    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, {COMMAND: wanted}, outputs)
 
 
 def _features(model: RobotModel, positions: FloatArray) -> dict[str, FloatArray]:

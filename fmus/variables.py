@@ -96,45 +96,31 @@ class View(NamedTuple):
         """Features and place of the cameras, for descriptions."""
         return f"{self.setup.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
 
-    def parameters(self) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-        """Return name, shape, unit and description of each kinematic parameter of target and cameras, in order."""
+    def parameters(self) -> tuple[Group, ...]:
+        """Return the kinematic parameters of target and cameras, in order."""
         c, p = self.setup.cameras, len(self.setup.target)
         on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
+        middle = "Principal point, from the upper left corner of the image."
+        turned = f"Roll, pitch and yaw of the cameras in the {on} frame."
         return (
-            ("target", (p, 3), "m", f"Points of the target in the {off} frame."),
-            ("camera_position", (c, 3), "m", f"Cameras in the {on} frame."),
-            ("camera_rpy", (c, 3), "rad", f"Roll, pitch and yaw of the cameras in the {on} frame."),
-            ("focal_length", (c,), "px", "Focal length of each camera."),
-            ("principal_point", (c, 2), "px", "Principal point, from the upper left corner of the image."),
-            ("distortion", (c,), "1", "First coefficient of radial distortion."),
+            Group("target", (p, 3), PARAMETER, "m", f"Points of the target in the {off} frame."),
+            Group("camera_position", (c, 3), PARAMETER, "m", f"Cameras in the {on} frame."),
+            Group("camera_rpy", (c, 3), PARAMETER, "rad", turned),
+            Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
+            Group("principal_point", (c, 2), PARAMETER, "px", middle),
+            Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
         )
 
-    def outputs(self, n: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-        """Return name, shape, unit and description of each output of an arm with `n` joints."""
+    def outputs(self, n: int) -> tuple[Group, ...]:
+        """Return the outputs of an arm with `n` joints that the generated core computes."""
         m, unit = self.setup.m, self.setup.unit
-        names = ", ".join(self.setup.features)
+        visible = "1 where a camera sees the feature, with nothing in between; 0 elsewhere."
+        slope = "Derivative of feature by joint_position; for evaluation."
         return (
-            (FEATURE, (m,), unit, f"Measured features: {names}."),
-            (SEEN, (m,), "1", "1 where a camera sees the feature, with nothing in between; 0 elsewhere."),
-            ("jacobian", (m, n), f"{unit}/rad", "Derivative of feature by joint_position; for evaluation."),
+            Group(FEATURE, (m,), OUTPUT, unit, f"Measured features: {', '.join(self.setup.features)}."),
+            Group(SEEN, (m,), OUTPUT, "1", visible),
+            Group("jacobian", (m, n), OUTPUT, f"{unit}/rad", slope),
         )
-
-
-def view_parameters(model: SetupModel) -> dict[str, FloatArray]:
-    """Return the values of the parameters of target and cameras by name, (..., size)."""
-
-    def flat(values: FloatArray, axes: int) -> FloatArray:
-        return np.reshape(values, (*values.shape[: values.ndim - axes], -1))
-
-    optics = model.optics
-    return {
-        "target": flat(model.target, 2),
-        "camera_position": flat(model.cameras[..., :3, 3], 2),
-        "camera_rpy": flat(rpy_from_rotation(model.cameras[..., :3, :3]), 2),
-        "focal_length": optics.focal,
-        "principal_point": flat(optics.centre, 2),
-        "distortion": optics.distortion,
-    }
 
 
 def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
@@ -158,7 +144,7 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
         Group("yaw", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: yaw of the {table}."),
         Group("joint_offset", (n,), PARAMETER, "rad", "True joint angle at a reported position of zero."),
         Group("gear_ratio", (n,), PARAMETER, "1", "True joint motion over reported joint motion."),
-        *_of_sensing(view),
+        *(BALL_PARAMETERS if view is None else view.parameters()),
         Group("lag", (n,), PARAMETER, "s", "Time constant of the joint's velocity loop; 0 for none.", 0.0),
         Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
@@ -172,25 +158,19 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
         Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
         Group("stop_indicator", (n, 2), INDICATOR, "1", "Distance to lower and upper stop; at a stop the command."),
         Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
-        *_outputs(n, view),
+        *(_ball_outputs(n) if view is None else view.outputs(n)),
     )
 
 
-def _of_sensing(view: View | None) -> tuple[Group, ...]:
-    """Return the kinematic parameters of target and cameras."""
-    if view is not None:
-        return tuple(Group(name, shape, PARAMETER, unit, text) for name, shape, unit, text in view.parameters())
-    return (
-        Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
-        Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
-        Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
-    )
+BALL_PARAMETERS: Final = (
+    Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
+    Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
+    Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
+)
 
 
-def _outputs(n: int, view: View | None) -> tuple[Group, ...]:
-    """Return the outputs that the generated core computes."""
-    if view is not None:
-        return tuple(Group(name, shape, OUTPUT, unit, text) for name, shape, unit, text in view.outputs(n))
+def _ball_outputs(n: int) -> tuple[Group, ...]:
+    """Return the outputs that the generated core computes of the ball in 3-D."""
     return (
         Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group(SEEN, (3,), OUTPUT, "1", "1: the camera sees the ball wherever it is."),
@@ -299,11 +279,20 @@ def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArr
 
 
 def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
-    if isinstance(model, SetupModel):
-        return view_parameters(model)
-    pose = model.camera
+    """Return the values of the parameters of target and cameras by name, (..., size)."""
+    if not isinstance(model, SetupModel):
+        pose, angles = model.camera, rpy_from_rotation(model.camera[..., :3, :3])
+        return {"tool": model.arm.tool, "camera_position": pose[..., :3, 3], "camera_rpy": angles}
+
+    def flat(values: FloatArray) -> FloatArray:
+        return np.reshape(values, (*values.shape[:-2], -1))
+
+    optics = model.optics
     return {
-        "tool": model.arm.tool,
-        "camera_position": pose[..., :3, 3],
-        "camera_rpy": rpy_from_rotation(pose[..., :3, :3]),
+        "target": flat(model.target),
+        "camera_position": flat(model.cameras[..., :3, 3]),
+        "camera_rpy": flat(rpy_from_rotation(model.cameras[..., :3, :3])),
+        "focal_length": optics.focal,
+        "principal_point": flat(optics.centre),
+        "distortion": optics.distortion,
     }

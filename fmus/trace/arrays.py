@@ -9,6 +9,8 @@ used wherever numpy wants numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import count
 from types import SimpleNamespace
 from typing import Any, ClassVar, TypeAlias
 
@@ -161,44 +163,6 @@ class Traced(NDArrayOperatorsMixin):
         """Return a view with another table of places."""
         return Traced(self.buffer, np.asarray(places), self.kind)
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Sizes of its axes."""
-        return self.places.shape
-
-    @property
-    def ndim(self) -> int:
-        """Number of axes."""
-        return self.places.ndim
-
-    @property
-    def size(self) -> int:
-        """Number of entries."""
-        return self.places.size
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of its numbers, as numpy's."""
-        return DTYPES[self.kind]
-
-    @property
-    def T(self) -> Traced:
-        """Transpose."""
-        return self.arranged(self.places.T)
-
-    @property
-    def mT(self) -> Traced:
-        """Transpose of the last two axes."""
-        return self.arranged(self.places.mT)
-
-    def reshape(self, *shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
-        """Return the entries in another shape."""
-        return self.arranged(self.places.reshape(*shape))
-
-    def swapaxes(self, one: int, other: int) -> Traced:
-        """Return a view with two axes exchanged."""
-        return self.arranged(self.places.swapaxes(one, other))
-
     def copy(self) -> Traced:
         """Return a copy with a buffer of its own."""
         return Traced.plain(self.numbers()) if self.constant else Traced.of(self.flat(), self.shape, self.kind)
@@ -220,24 +184,26 @@ class Traced(NDArrayOperatorsMixin):
         """Return bytes that equal those of no other array, so that a memo of it is never used for another one."""
         return b"traced %d %d" % (id(self), next(_COUNTER))
 
-    def _called(self, name: str, *arguments: Any, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
-        return getattr(np, name)(self, *arguments, **options)
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its numbers, as numpy's."""
+        return DTYPES[self.kind]
 
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - a method of numpy's arrays
-        """Return a method that numpy has as a function as well."""
-        if name not in METHODS:
-            raise AttributeError(f"Traced has no attribute {name!r}")
-        return lambda *arguments, **options: self._called(name, *arguments, **options)
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - an attribute of numpy's arrays
+        """Return an attribute of numpy's arrays: of the table of places, or a method that is a function as well."""
+        if name in SIZES:
+            return getattr(self.places, name)
+        if name in TRANSPOSES:
+            return self.arranged(getattr(self.places, name))
+        if name in VIEWS:
+            return lambda *arguments: self.arranged(getattr(self.places, name)(*arguments))
+        if name in METHODS:
+            return partial(getattr(np, name), self)
+        raise AttributeError(f"Traced has no attribute {name!r}")
 
 
-def _counter() -> Iterator[int]:
-    number = 0
-    while True:
-        yield number
-        number += 1
-
-
-_COUNTER = _counter()
+_COUNTER = count()
+SIZES, TRANSPOSES, VIEWS = {"shape", "ndim", "size"}, {"T", "mT"}, {"reshape", "swapaxes"}
 METHODS = {
     "sum", "mean", "max", "min", "any", "all", "argmin", "argmax", "cumsum", "trace", "diagonal", "take", "dot",
     "repeat", "ravel", "squeeze", "transpose", "clip",

@@ -66,12 +66,8 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - any tree
     return type(value)(_plain(each) for each in value) if type(value) in {list, tuple} else value
 
 
-def _concatenate(arrays: Sequence[Any], axis: int = 0) -> Traced:
-    return joined(arrays, lambda tables: np.concatenate(tables, axis=axis))
-
-
-def _stack(arrays: Sequence[Any], axis: int = 0) -> Traced:
-    return joined(arrays, lambda tables: np.stack(tables, axis=axis))
+def _joining(function: Callable[..., Any]) -> Callable[..., Traced]:
+    return lambda arrays, axis=0: joined(arrays, lambda tables: function(tables, axis=axis))
 
 
 def _like(value: float) -> Callable[..., Traced]:
@@ -89,21 +85,17 @@ def _full_like(array: Any, fill_value: Any, dtype: Any = None) -> Traced:  # noq
     return new
 
 
-def _sum(array: Any, axis: Any = None, dtype: Any = None, keepdims: bool = False) -> Traced:  # noqa: ANN401
-    del dtype
-    return reduced("add", array, axis, keepdims)
-
-
 def _mean(array: Any, axis: Any = None, keepdims: bool = False) -> Traced:  # noqa: ANN401 - as numpy's
-    total = _sum(array, axis, None, keepdims)
+    total = reduced("add", array, axis, keepdims)
     return elementwise("divide", total, np.size(array) / max(total.size, 1))
 
 
 def _reduction(name: str) -> Callable[..., Traced]:
-    def reduction(array: Any, axis: Any = None, keepdims: bool = False, initial: Any = None) -> Traced:  # noqa: ANN401
+    def reduce(array: Any, axis: Any = None, keepdims: bool = False, initial: Any = None, dtype: Any = None) -> Traced:  # noqa: ANN401
+        del dtype
         return reduced(name, array, axis, keepdims, initial)
 
-    return reduction
+    return reduce
 
 
 def _extreme(name: str) -> Callable[..., Traced]:
@@ -128,7 +120,7 @@ def _cumsum(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as
     sums = [rows[..., 0]]
     for k in range(1, rows.shape[-1]):
         sums.append(elementwise("add", sums[-1], rows[..., k]))
-    summed = _stack(sums, axis=-1)
+    summed = _joining(np.stack)(sums, axis=-1)
     return summed if axis is None else summed.arranged(np.moveaxis(summed.places, -1, axis))
 
 
@@ -344,9 +336,10 @@ def pseudo_inverse(a: Any) -> Traced:  # noqa: ANN401 - anything array-like
 
 
 FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
-    np.concatenate: _concatenate, np.stack: _stack, np.where: _where, np.take: _take, np.diff: _diff,
+    np.concatenate: _joining(np.concatenate), np.stack: _joining(np.stack),
+    np.where: _where, np.take: _take, np.diff: _diff,
     np.zeros_like: _like(0.0), np.empty_like: _like(0.0), np.ones_like: _like(1.0), np.full_like: _full_like,
-    np.sum: _sum, np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
+    np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
     np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum, np.trace: _trace,
     np.clip: _clip, np.dot: _dot, np.count_nonzero: _count_nonzero,

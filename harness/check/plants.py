@@ -48,7 +48,7 @@ def check_plant(
         ConfigurationError: there is no such plant, or it cannot be loaded; it is a ValueError.
     """
     with offering():
-        entry = find_plant(choose_plant(plant))
+        entry = plant if isinstance(plant, PlantEntry) else find_plant(choose_plant(plant))
         return report(entry.name, PlantChecks(entry).carry_out(begin), found)
 
 

@@ -27,7 +27,7 @@ from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
 
 if TYPE_CHECKING:
-    from servobench.plant.rendered.engine import OpenScene
+    from servobench.plant.rendered.engine import Scene
 
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
@@ -306,15 +306,11 @@ def default_plant() -> tuple[str, str]:
     return UNRENDERED, missing[RENDERED[has_no_wheel()]]
 
 
-def scene_of(plant: str) -> OpenScene:
-    """Return the constructor of scenes of a rendered plant's engine; engines load slowly, so only here."""
-    if plant == "mujoco":
-        from servobench.plant.rendered.mujoco import MujocoScene  # noqa: PLC0415
+def scene_of(plant: str) -> type[Scene]:
+    """Return the scenes of a rendered plant's engine; engines load slowly, so only here."""
+    from servobench.plant.rendered.plants import load_engine  # noqa: PLC0415
 
-        return MujocoScene
-    from servobench.plant.rendered.bullet import BulletScene  # noqa: PLC0415
-
-    return BulletScene
+    return load_engine(plant).scene
 
 
 def rendered_plant(named: str | None = None) -> str:

@@ -22,11 +22,11 @@ from servobench.fmus.controller_export import (
     REFERENCE,
     SEEN,
     ControllerModel,
-    ControllerRun,
     controller_groups,
 )
 from servobench.fmus.export import ExportOptions, default_actuation, product
 from servobench.fmus.product import Product
+from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
@@ -101,7 +101,7 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     )
 
 
-def _difference(recorded: Recorded, run: ControllerRun) -> float:
+def _difference(recorded: Recorded, run: ReferenceRun) -> float:
     """Return the largest difference of the recorded outputs from those of a run, as `fmu validate` counts it."""
     inputs = np.column_stack([run.time, *run.inputs.values()])
     wanted = np.column_stack(list(run.outputs.values()))
@@ -131,7 +131,7 @@ def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[S
     return state, np.concatenate([velocity, known.reshape(-1)])
 
 
-def _run(experiment: Experiment) -> ControllerRun:
+def _run(experiment: Experiment) -> ReferenceRun:
     """Carry out the run that the FMU repeats for comparison; it may end early."""
     controller, spec = experiment.controller, experiment.plant.spec
     unknown = np.zeros(spec.m * spec.n)
@@ -152,7 +152,7 @@ def _run(experiment: Experiment) -> ControllerRun:
             raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
     time, *columns = (np.array(column) for column in zip(*inputs, strict=True))
     answers = (np.array(column) for column in zip(*outputs, strict=True))
-    return ControllerRun(
+    return ReferenceRun(
         time,
         dict(zip((POSITION, FEATURE, SEEN, REFERENCE), columns, strict=True)),
         dict(zip((COMMAND, JACOBIAN), answers, strict=True)),

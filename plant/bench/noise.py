@@ -28,9 +28,8 @@ from servobench.plant.contract.sensing import Family, SensingConfig
 Shape: TypeAlias = tuple[int, ...]
 Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 
-TINY: Final = (
-    2.0**-54
-)  # floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers
+# Floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers.
+TINY: Final = 2.0**-54
 
 
 def white(generator: np.random.Generator, shape: Shape) -> FloatArray:

@@ -58,8 +58,9 @@ class Sensor:
         self._scale = config.noise_factor * config.feature_noise
         stream: Callable[..., Stream] = partial(Stream, seed)
         self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
-        self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
-        self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
+        share = np.random.Generator.random
+        self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
+        self._outlier_begins, self._occlusion_begins = stream("outliers", share), stream("occlusions", share)
         self._outlier_values = stream("outlier_values", draw_directions, (m,), config.outlier_size)
         frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
         self._frames = frames[0], frames[1]

@@ -111,13 +111,6 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
     return axes, origins, rotation, position
 
 
-def symbolic_ball(model: HandEyeModel) -> casadi.Function:
-    """Return q -> feature, (n,) rad -> (3,) m, with the numbers of `model` bound."""
-    q = casadi.SX.sym("joint_position", model.arm.n)
-    feature = feature_and_jacobian(q, HandEyeGeometry.of(model))[0]
-    return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
-
-
 @dataclass(frozen=True, eq=False)
 class SetupGeometry:
     """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants.
@@ -147,13 +140,14 @@ def symbolic_feature(model: RobotModel) -> casadi.Function:
     Raises:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
-    if isinstance(model, HandEyeModel):
-        return symbolic_ball(model)
-    if not isinstance(model, SetupModel):
-        raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
     q = casadi.SX.sym("joint_position", model.arm.n)
-    geometry = SetupGeometry.of(model)
-    feature = features(points_in_cameras(q, geometry, model.mount), geometry.optics, model.setup)
+    if isinstance(model, HandEyeModel):
+        feature, _ = feature_and_jacobian(q, HandEyeGeometry.of(model))
+    elif isinstance(model, SetupModel):
+        geometry = SetupGeometry.of(model)
+        feature = features(points_in_cameras(q, geometry, model.mount), geometry.optics, model.setup)
+    else:
+        raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
     return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 

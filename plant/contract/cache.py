@@ -114,14 +114,10 @@ def _prune(kind: Path) -> None:
 
 @contextlib.contextmanager
 def _alone(kind: Path) -> Iterator[None]:
-    """Hold a lock against other processes that move entries of a kind, where the system has locks."""
-    with (kind / ".lock").open("a") as file, contextlib.ExitStack() as stack:
-        try:
-            import fcntl  # noqa: PLC0415 - not on Windows
-        except ImportError:
-            pass
-        else:
-            with contextlib.suppress(OSError):  # The file system may have no locks.
-                fcntl.flock(file, fcntl.LOCK_EX)
-                stack.callback(fcntl.flock, file, fcntl.LOCK_UN)
+    """Hold a lock, until its file is closed, against other processes that move entries of a kind."""
+    with (kind / ".lock").open("a") as file:
+        with contextlib.suppress(ImportError, OSError):  # Windows has no such locks, nor have all file systems.
+            import fcntl  # noqa: PLC0415
+
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield

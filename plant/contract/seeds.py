@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +57,7 @@ class Stream:
         self,
         seeds: Seeds,
         name: str,
-        draw: Literal["standard_normal", "random"] | Callable[[np.random.Generator, tuple[int, ...]], FloatArray],
+        draw: Callable[[np.random.Generator, tuple[int, ...]], FloatArray],
         shape: tuple[int, ...] = (),
         factor: float = 1.0,
     ) -> None:
@@ -66,7 +66,7 @@ class Stream:
         Args:
             seeds: one, or one for each of the runs side by side, which gives every draw a leading axis.
             name: of the part.
-            draw: method of the generators, or a function of a generator and a shape.
+            draw: function of a generator and a shape, such as `numpy.random.Generator.random`.
             shape: of a draw of one run.
             factor: on all numbers.
 
@@ -86,19 +86,12 @@ class Stream:
         """Return the next draw of each run, (..., *shape)."""
         if self._used == BLOCK:
             self._generators = self._generators or [named_generator(seed, self._name) for seed in self._seeds]
-            drawn = [self._drawn(generator) for generator in self._generators]
+            drawn = [self._draw(generator, self._shape) for generator in self._generators]
             self._block = self._factor * (drawn[0] if self._single else np.stack(drawn, axis=1))
             self._used = 0
         self._used += 1
         row: FloatArray = self._block[self._used - 1]
         return row
-
-    def _drawn(self, generator: np.random.Generator) -> FloatArray:
-        draw = self._draw
-        numbers: FloatArray = (
-            getattr(generator, draw)(self._shape) if isinstance(draw, str) else draw(generator, self._shape)
-        )
-        return numbers
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """Drop the streams of all other lanes."""

@@ -23,25 +23,12 @@ MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
 MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
 MAX_RATIO: Final = 100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
 SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
-DISK: Final = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EROFS,
-    errno.EIO,
-    errno.EACCES,
-)  # errors of the disk, not of the archive
+# Errors of the disk, not of the archive.
+DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
 DAMAGES: Final = (  # raised by Python's reader of archives
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    EOFError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    RuntimeError,
-    ValueError,
-)
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, OSError, OverflowError,
+    RuntimeError, ValueError,
+)  # fmt: skip
 
 
 def extract_fmu(path: Path) -> Path:

@@ -22,9 +22,8 @@ from servobench.plant.fmu.archive import DESCRIPTION
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
 MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
-IDENTIFIER: Final = re.compile(
-    r"(?!\.)[\w.+ -]{1,200}"
-)  # a file name without folders; the standard wants an identifier of C
+# A file name without folders; the standard wants an identifier of C.
+IDENTIFIER: Final = re.compile(r"(?!\.)[\w.+ -]{1,200}")
 
 
 @dataclass(frozen=True)

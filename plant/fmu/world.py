@@ -37,10 +37,8 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
-BITS: Final = {
-    "Integer": 32,
-    "Enumeration": 32,
-    **{f"{sign}Int{bits}": bits for sign in ("", "U") for bits in (8, 16, 32, 64)},
+INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32"} | {
+    f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
 }
 EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
@@ -346,10 +344,9 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
         fits, wanted = given.dtype.kind == "U", "text"
     elif kind == "Boolean":
         fits, wanted = given.dtype.kind == "b", "true or false"
-    elif kind in BITS:
-        signed = not kind.startswith("U")
-        low, high = (-(2 ** (BITS[kind] - 1)), 2 ** (BITS[kind] - 1) - 1) if signed else (0, 2 ** BITS[kind] - 1)
-        low, high = max(low, -EXACT), min(high, EXACT)
+    elif kind in INTEGERS:
+        bounds = np.iinfo(INTEGERS[kind])
+        low, high = max(int(bounds.min), -EXACT), min(int(bounds.max), EXACT)
         fits = given.dtype.kind == "f" and bool(((given == np.round(given)) & (given >= low) & (given <= high)).all())
         wanted = f"a whole number from {low} to {high}"
     elif kind in REAL_TYPES:

@@ -14,7 +14,7 @@ import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,7 +23,7 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window
 from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
-from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Machine, Overlap, Scene, Simulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import arm_mechanics, boxes_urdf, room_boxes
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
@@ -65,37 +65,27 @@ def describe_renderer() -> str:
     return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 
 
-class BulletScene(Scene):
-    """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
+class PhysicsWorld:
+    """A world of PyBullet.
 
-    def __init__(self, room: Room, *, window: bool = False) -> None:
-        """Open a world and load the room; see `OpenScene`.
+    Attributes:
+        client: its number in all calls; -1 once it is closed.
+    """
+
+    def __init__(self, mode: int = pybullet.DIRECT) -> None:
+        """Open a world.
 
         Raises:
-            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
             ConnectionError: PyBullet opens no world, as too many are open.
         """
-        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
-        self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
-        if self._client < 0:
+        self.client: int = pybullet.connect(mode)
+        if self.client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
-        try:
-            self._load(room)
-            if window:
-                self._aim_window()
-        except BaseException:
-            self.close()
-            raise
-        n = room.arm.n
-        self._joints = list(range(n))
-        self._ball_link = n + 1
-
-    def _load(self, room: Room) -> None:
-        client = self._client
         # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
-        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
-        files = room.files()
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
+
+    def load(self, files: Mapping[str, str], flags: int = 0) -> int:
+        """Load the URDFs among files, text by name, with the meshes they name, and return the number of the first."""
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
             for name, text in files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")
@@ -103,30 +93,62 @@ class BulletScene(Scene):
                 pybullet.loadURDF(
                     str(Path(folder) / name),
                     useFixedBase=True,
-                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-                    physicsClientId=client,
+                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE | flags,
+                    physicsClientId=self.client,
                 )
                 for name in files
                 if name.endswith(".urdf")
             ]
-        self._arm = bodies[0]
+        return int(bodies[0])
+
+    def place(self, body: int, angles: FloatArray) -> None:
+        """Put the joints of a body at angles (n,) rad."""
+        for joint, angle in enumerate(angles.tolist()):
+            pybullet.resetJointState(body, joint, angle, physicsClientId=self.client)
+
+    def close(self) -> None:
+        """Close the world; calling it twice is allowed."""
+        client, self.client = self.client, -1
+        if client >= 0 and pybullet.isConnected(client):
+            pybullet.disconnect(client)
+
+
+class BulletScene(Scene):
+    """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
+
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Open a world and load the room; see `Scene`.
+
+        Raises:
+            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
+        """
+        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+        self._world = PhysicsWorld(pybullet.GUI if window else pybullet.DIRECT)
+        try:
+            self._arm = self._world.load(room.files())
+            if window:
+                self._aim_window()
+        except BaseException:
+            self.close()
+            raise
+        self._ball_link = room.arm.n + 1
 
     def _aim_window(self) -> None:
         """Show the arm from the front right, without PyBullet's side panels."""
-        client = self._client
+        client = self._world.client
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
         pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
     def place(self, theta: FloatArray) -> None:
         """See `Scene.place`."""
-        for joint, angle in zip(self._joints, theta.tolist(), strict=True):
-            pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._client)
+        self._world.place(self._arm, theta)
 
     def ball_position(self) -> FloatArray:
         """See `Scene.ball_position`; from the simulator's own link state."""
-        state = pybullet.getLinkState(
-            self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=self._client
-        )
+        client = self._world.client
+        state = pybullet.getLinkState(self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=client)
         return np.array(state[4])
 
     def render(
@@ -140,7 +162,7 @@ class BulletScene(Scene):
             shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._client,
+            physicsClientId=self._world.client,
         )
         # A PyBullet built without numpy returns tuples.
         shape = (camera.height, camera.width)
@@ -149,10 +171,7 @@ class BulletScene(Scene):
 
     def close(self) -> None:
         """See `Scene.close`."""
-        if self._client >= 0:
-            client, self._client = self._client, -1
-            if pybullet.isConnected(client):
-                pybullet.disconnect(client)
+        self._world.close()
 
 
 class BulletSimulation(Simulation):
@@ -166,39 +185,25 @@ class BulletSimulation(Simulation):
             ConnectionError: PyBullet opens no world, as too many are open.
         """
         arm, robot, drives = machine.arm, machine.robot, machine.drives
-        self._client: int = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise ConnectionError("PyBullet could not open a physics world")
+        self._world = PhysicsWorld()
         try:
-            pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._client)
-            pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self._client)
+            pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._world.client)
             loaded = arm_mechanics(arm, drives.payload, shapes=True, robot=robot)
             self._arm = self._load(loaded, pybullet.URDF_USE_SELF_COLLISION)
-            self._assumed = self._load(arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot), 0)
+            self._assumed = self._load(arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot))
             room = (*room_boxes(robot.workspace.scale), *machine.boxes)
-            self._boxes = {self._load(boxes_urdf((box,)), 0): box.name for box in room}
+            self._boxes = {self._load(boxes_urdf((box,))): box.name for box in room}
             start = machine.start.tolist()
-            inertia = np.array(pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=self._client))
+            inertia = np.array(pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=self._world.client))
             self._drives = Drives(drives, machine.lag, inertia, machine.stops)
         except BaseException:
             self.close()
             raise
         self._dynamics = drives.dynamics
-        self._joints = list(range(arm.n))
         self._rest = [0.0] * arm.n
 
-    def _load(self, urdf: str, flags: int) -> int:
-        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
-            path = Path(folder) / "body.urdf"
-            path.write_text(urdf, encoding="utf-8")
-            return int(
-                pybullet.loadURDF(
-                    str(path),
-                    useFixedBase=True,
-                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE | flags,
-                    physicsClientId=self._client,
-                )
-            )
+    def _load(self, urdf: str, flags: int = 0) -> int:
+        return self._world.load({"body.urdf": urdf}, flags)
 
     def start(self, angle: FloatArray) -> DriveState:
         """See `Simulation.start`."""
@@ -217,7 +222,7 @@ class BulletSimulation(Simulation):
 
     def body(self, angle: FloatArray, speed: FloatArray) -> RigidBody:
         """Return inertia and torques at joint angles (n,) [rad] and speeds (n,) [rad/s]."""
-        theta, rest, client, torques = angle.tolist(), self._rest, self._client, pybullet.calculateInverseDynamics
+        theta, rest, client, torques = angle.tolist(), self._rest, self._world.client, pybullet.calculateInverseDynamics
         return RigidBody(
             np.array(pybullet.calculateMassMatrix(self._arm, theta, physicsClientId=client)),
             np.array(torques(self._arm, theta, speed.tolist(), rest, physicsClientId=client)),
@@ -226,9 +231,8 @@ class BulletSimulation(Simulation):
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""
-        client, n = self._client, len(self._joints)
-        for joint, value in zip(self._joints, angle.tolist(), strict=True):
-            pybullet.resetJointState(self._arm, joint, value, physicsClientId=client)
+        client, n = self._world.client, len(angle)
+        self._world.place(self._arm, angle)
         pybullet.performCollisionDetection(physicsClientId=client)
         for point in pybullet.getContactPoints(bodyA=self._arm, physicsClientId=client):
             if point[CONTACT_DISTANCE] <= -MIN_OVERLAP:
@@ -237,7 +241,7 @@ class BulletSimulation(Simulation):
 
     def close(self) -> None:
         """See `Simulation.close`."""
-        if self._client >= 0:
-            client, self._client = self._client, -1
-            if pybullet.isConnected(client):
-                pybullet.disconnect(client)
+        self._world.close()
+
+
+ENGINE = Engine(BulletScene, BulletSimulation, describe_renderer)

@@ -29,6 +29,7 @@ from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import BoolArray, Truth
+from servobench.plant.rendered.depth import measure_depth
 from servobench.plant.rendered.detection import (
     OUTLINE,
     ByteArray,
@@ -117,7 +118,7 @@ class DepthCamera:
     def __init__(self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float) -> None:
         """Take a scene and the radius of its ball [m]."""
         self.camera, self.radius = camera, radius
-        self._scene, self._depth_noise = scene, config.noise()
+        self._scene, self._config = scene, config
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
     def find(self, X_BC: FloatArray, ball: FloatArray, noise: Generators) -> Detection | None:
@@ -136,7 +137,7 @@ class DepthCamera:
             rgba = add_colour_noise(rgba, self._deviation, noise[COLOUR])
 
         def with_noise(depth: FloatArray, patch: Patch) -> FloatArray:
-            return self._depth_noise.apply(depth, (patch.rows, patch.columns), self.camera, noise[DEPTH])
+            return measure_depth(self._config, depth, patch, self.camera, noise[DEPTH])
 
         return find_ball(rgba, buffer, self.camera, self.radius, with_noise, (window.top, window.left))
 

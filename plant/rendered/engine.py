@@ -26,6 +26,18 @@ class Scene(ABC):
     """An arm with a ball on its flange, for rendering only."""
 
     @abstractmethod
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Open a world and load the room.
+
+        Args:
+            room: the bodies.
+            window: whether to open the engine's window.
+
+        Raises:
+            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
+        """
+
+    @abstractmethod
     def place(self, theta: FloatArray) -> None:
         """Put the arm at joint angles `theta` (n,) rad."""
 
@@ -45,21 +57,6 @@ class Scene(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the engine's world; calling it twice is allowed."""
-
-
-class OpenScene(Protocol):
-    """The constructor of an engine's scene."""
-
-    def __call__(self, room: Room, *, window: bool = False) -> Scene:
-        """Open a world and load the room.
-
-        Args:
-            room: the bodies.
-            window: whether to open the engine's window.
-
-        Raises:
-            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
-        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +129,16 @@ class Simulation(ABC):
 
 
 class Engine(NamedTuple):
-    """A physics engine, by the constructors of its scenes and simulations.
+    """A physics engine.
 
     Attributes:
         scene: for the camera.
         simulation: for the motion.
+        describe: returns one line about the engine and the library that renders its images.
+        lacking: returns one line about missing parts of this machine; empty if nothing is missing.
     """
 
-    scene: OpenScene
+    scene: type[Scene]
     simulation: Callable[[Machine], Simulation]
+    describe: Callable[[], str]
+    lacking: Callable[[], str] = str

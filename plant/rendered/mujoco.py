@@ -29,7 +29,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
-from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Machine, Overlap, Scene, Simulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
@@ -132,7 +132,7 @@ class MujocoScene(Scene):
     """An arm with a ball on its flange in a MuJoCo model of its own; joint angles here are the true ones, θ."""
 
     def __init__(self, room: Room, *, window: bool = False) -> None:
-        """Load the room; see `OpenScene`.
+        """Load the room; see `Scene`.
 
         Raises:
             ValueError: a robot with another number of joints, nothing to render with, or a window is wanted.
@@ -401,3 +401,6 @@ def read_urdf(text: str, meshes: Mapping[str, str] | None = None, *, fuse: bool 
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a flat one has no volume
     return spec
+
+
+ENGINE = Engine(MujocoScene, MujocoSimulation, describe_renderer, missing_renderer)

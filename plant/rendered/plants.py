@@ -1,79 +1,67 @@
-"""The rendered plants, one for each physics engine; an engine is imported when a plant is built on it."""
+"""The rendered plants, one for each physics engine."""
 
 from __future__ import annotations
 
-from servobench.plant.bench.bench import Bench
+from dataclasses import replace
+from functools import partial
+
+from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.rendered.engine import Engine
 from servobench.plant.rendered.settings import RenderedConfig, rendered_config
-from servobench.plant.rendered.world import build_rendered
+from servobench.plant.rendered.world import RenderedWorld
 
 
-def build_bullet(config: RenderedConfig, setup: PlantSetup) -> Bench:
-    """Return the rendered plant on PyBullet, which loads slowly.
+def load_engine(plant: str) -> Engine:
+    """Return the physics engine of a plant, which is imported now: PyBullet loads slowly, and MuJoCo is an extra."""
+    if plant == "mujoco":
+        from servobench.plant.rendered.mujoco import ENGINE as MUJOCO_ENGINE  # noqa: PLC0415
+
+        return MUJOCO_ENGINE
+    from servobench.plant.rendered.bullet import ENGINE as BULLET_ENGINE  # noqa: PLC0415
+
+    return BULLET_ENGINE
+
+
+def build_rendered(plant: str, config: RenderedConfig, setup: PlantSetup) -> Bench:
+    """Return a rendered plant by its name.
 
     Raises:
-        ValueError: see `servobench.plant.rendered.world.RenderedWorld`.
+        ValueError: see `RenderedWorld`; or this machine cannot render.
     """
-    from servobench.plant.rendered.bullet import BulletScene, BulletSimulation  # noqa: PLC0415
+    make = partial(RenderedWorld, load_engine(plant), config)
+    return build_bench(make, setup, config.command_delay, config.sensing)
 
-    return build_rendered(Engine(BulletScene, BulletSimulation), config, setup)
+
+def describe_engine(plant: str) -> str:
+    """Return the engine of a plant with its version, and the library that renders its images."""
+    return load_engine(plant).describe()
 
 
-def bullet_renderer() -> str:
-    """Return the engine that renders the images, with its version."""
-    from servobench.plant.rendered.bullet import describe_renderer  # noqa: PLC0415
-
-    return describe_renderer()
+def mujoco_lacks() -> str:
+    """Return how to install the renderer that this machine lacks; empty if it can render."""
+    try:
+        return load_engine("mujoco").lacking()
+    except (ImportError, RuntimeError) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
+        return f"MuJoCo cannot be loaded: {error}"
 
 
 BULLET = PlantEntry(
     name="bullet",
     summary="PyBullet arm with dynamics; ball or discs are found in the rendered images of its cameras",
     config=RenderedConfig,
-    build=build_bullet,
+    build=partial(build_rendered, "bullet"),
     needs=("pybullet",),
-    engine=bullet_renderer,
+    engine=partial(describe_engine, "bullet"),
     config_for=rendered_config,
     any_sensing=True,
 )
-
-
-def build_mujoco(config: RenderedConfig, setup: PlantSetup) -> Bench:
-    """Return the rendered plant on MuJoCo, which is an extra.
-
-    Raises:
-        ValueError: see `servobench.plant.rendered.world.RenderedWorld`; or this machine cannot render.
-    """
-    from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation  # noqa: PLC0415
-
-    return build_rendered(Engine(MujocoScene, MujocoSimulation), config, setup)
-
-
-def mujoco_lacks() -> str:
-    """Return how to install the renderer that this machine lacks; empty if it can render."""
-    try:
-        from servobench.plant.rendered.mujoco import missing_renderer  # noqa: PLC0415
-    except (ImportError, RuntimeError) as error:  # incompatible parts, or a MUJOCO_GL that MuJoCo does not know
-        return f"MuJoCo cannot be loaded: {error}"
-    return missing_renderer()
-
-
-def mujoco_renderer() -> str:
-    """Return which engine computes, and which library renders its images."""
-    from servobench.plant.rendered.mujoco import describe_renderer  # noqa: PLC0415
-
-    return describe_renderer()
-
-
-MUJOCO = PlantEntry(
+MUJOCO = replace(
+    BULLET,
     name="mujoco",
-    summary="MuJoCo arm with dynamics; ball or discs are found in the rendered images of its cameras",
-    config=RenderedConfig,
-    build=build_mujoco,
+    summary=BULLET.summary.replace("PyBullet", "MuJoCo"),
+    build=partial(build_rendered, "mujoco"),
     needs=("mujoco",),
     lacking=mujoco_lacks,
-    engine=mujoco_renderer,
-    config_for=rendered_config,
-    any_sensing=True,
+    engine=partial(describe_engine, "mujoco"),
 )

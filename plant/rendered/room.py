@@ -24,7 +24,6 @@ from servobench.plant.rendered.urdf import (
     add_joint,
     add_link,
     arm_tree,
-    arm_urdf,
     bench_files,
     boxes_urdf,
     draw_cylinder,
@@ -41,10 +40,8 @@ DISC_RADIUS: Final = 0.02  # [m] for a UR5
 PAD_RADIUS: Final = 0.035  # [m] of the white pad behind a disc, for a UR5
 LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
 ROD_RADIUS: Final = 0.004  # [m] for a UR5
-HOUSING: Final = (
-    0.02,
-    0.06,
-)  # [m] radius and length of a camera on the hand, for a UR5; too near to be in its own image
+# [m] Radius and length of a camera on the hand, for a UR5; too near to be in its own image.
+HOUSING: Final = (0.02, 0.06)
 OVERVIEW_POSITION: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
 OVERVIEW_TARGET: Final = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
 OVERVIEW_CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
@@ -125,9 +122,9 @@ def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
         robot: by its maker's description.
         rig: of the set-up; None for the ball on the flange.
     """
-    if rig is None:
-        return {"arm.urdf": arm_urdf(arm, robot)}
     tree = arm_tree(arm, robot)
+    if rig is None:
+        return {"arm.urdf": text(tree)}
     (carried,) = (link for link in tree.iter("link") if link.get("name") == BALL_LINK)
     for visual in carried.findall("visual"):
         carried.remove(visual)

@@ -12,7 +12,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, nested, settings
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
-from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
+from servobench.plant.robot.camera import FieldOfView, PinholeCamera
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
@@ -77,18 +77,6 @@ class RenderedConfig:
     def camera(self) -> PinholeCamera:
         """Return the camera's intrinsics."""
         return PinholeCamera(self.width, self.height, self.vertical_fov)
-
-    def noise(self) -> DepthNoise:
-        """Return the depth sensor's noise."""
-        return DepthNoise(
-            self.depth_noise,
-            self.depth_subpixel,
-            self.depth_baseline,
-            self.native_width,
-            self.depth_patch,
-            self.depth_quantisation,
-            self.sensing.noise_factor,
-        )
 
 
 def rendered_config(robot: Robot) -> RenderedConfig:

@@ -192,30 +192,13 @@ class Box(NamedTuple):
     size: tuple[float, float, float]
 
 
-def arm_urdf(arm: SerialArm, robot: Robot) -> str:
-    """Return the URDF of an arm with masses and visual shapes of a robot; its joint angles are the true ones, θ.
-
-    Args:
-        arm: the kinematics, mismatch included.
-        robot: by its maker's description, for masses and shapes.
-
-    Returns:
-        The URDF as text: the base, a link a joint in the arm's order, the flange and the ball, which is drawn by a
-        mesh in `BALL_MESH`.
-
-    Raises:
-        ValueError: the arm has another number of joints than the robot.
-    """
-    return text(arm_tree(arm, robot))
-
-
 def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool) -> str:
     """Return the URDF of an arm without visual shapes, with a point load at the ball.
 
     Args:
         arm: the kinematics, mismatch included.
         payload: kg.
-        shapes: whether the parts that `arm_urdf` draws are collision shapes.
+        shapes: whether the parts that `arm_tree` draws are collision shapes.
         robot: by its maker's description, for masses and shapes.
 
     Raises:
@@ -268,7 +251,17 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
 
 
 def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
-    """Return the tree of `arm_urdf`; arguments and errors are its own."""
+    """Return the URDF of an arm with masses and visual shapes of a robot; its joint angles are the true ones, θ.
+
+    It has the base, a link a joint, the flange and the ball, which is drawn by the mesh `BALL_MESH`.
+
+    Args:
+        arm: the kinematics, mismatch included.
+        described: by its maker's description, for masses and shapes.
+
+    Raises:
+        ValueError: the arm has another number of joints than the robot.
+    """
     own, ball_radius = described.links, described.workspace.ball_radius
     if arm.n != described.n:
         raise ValueError(f"arm must have {described.n} joints like the {described.title}, got {arm.n}")

@@ -12,12 +12,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantSetup, World
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
@@ -238,12 +236,3 @@ class RenderedWorld(World):
     def _keep_pace(self) -> None:
         """Wait until the wall clock has reached the time of the run; only with a window."""
         time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
-
-
-def build_rendered(engine: Engine, config: RenderedConfig, setup: PlantSetup) -> Bench:
-    """Return the rendered plant on a physics engine.
-
-    Raises:
-        ValueError: see `RenderedWorld`.
-    """
-    return build_bench(partial(RenderedWorld, engine, config), setup, config.command_delay, config.sensing)

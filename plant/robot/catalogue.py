@@ -26,6 +26,7 @@ from servobench.plant.robot.workspace import find_workspace, with_ball
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
     title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
 } | {"panda": panda}
+"""The arms by their makers' tables; each is made once."""
 
 
 def find_robot(text: str) -> Robot:
@@ -39,12 +40,12 @@ def find_robot(text: str) -> Robot:
         ValueError: an unknown name, or a file that cannot be used.
     """
     if text in ROBOTS:
-        return _known(text)
+        return ROBOTS[text]()
     kind, _, number = text.partition(":")
     if kind == RANDOM_ARM:
         if not (number.isascii() and number.isdigit() and len(number) <= len(str(MAX_NUMBER))):
             raise ValueError(f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7")
-        return _drawn(int(number))
+        return random_robot(int(number))
     path = user_path(text.partition("#")[0])
     if path.suffix.lower() not in {".yaml", ".yml", ".toml", ".urdf"}:
         raise ValueError(
@@ -56,16 +57,6 @@ def find_robot(text: str) -> Robot:
     except OSError as error:
         raise ValueError(f"robot file {path} cannot be read: {error.strerror}") from error
     return _read(text, changed)
-
-
-@cache
-def _known(name: str) -> Robot:
-    return ROBOTS[name]()
-
-
-@cache
-def _drawn(number: int) -> Robot:
-    return random_robot(number)
 
 
 @cache
@@ -86,6 +77,7 @@ SPEED: Final = math.pi  # [rad/s] of a joint
 MAX_DRAWS: Final = 200
 
 
+@cache
 def random_robot(number: int) -> Robot:
     """Return the random arm with a number; a number always gives the same arm.
 

@@ -257,10 +257,8 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
             raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(map(str, lost))!r}")
     if tip and tip not in links:
         raise ValueError(f"it has no link {tip!r}; valid: {', '.join(links)}")
-    ways = {name: _way(name, above) for name in ([tip] if tip else links)}
-    # The nearest of the links after the last rotating joint is the flange; fingers and cameras follow.
-    tip = max(ways, key=lambda name: (sum(map(_turns, ways[name])), -_after_last(ways[name])))
-    tip = tip if not _is_last_body(ways, tip) else _flange(ways, tip)
+    ways = {name: _way(name, above) for name in links}
+    tip = tip or _flange(ways)
     way = ways[tip]
     if sum(map(_turns, way)) < 3:
         raise ValueError("it has no chain of at least three turning joints")
@@ -289,21 +287,11 @@ def _way(link: str, above: dict[str, Any]) -> list[Any]:
     return way[::-1]
 
 
-def _after_last(way: list[Any]) -> int:
-    """Return the number of joints after the last rotating one."""
-    return next((i for i, joint in enumerate(reversed(way)) if _turns(joint)), len(way))
-
-
-def _is_last_body(ways: dict[str, list[Any]], tip: str) -> bool:
-    return len(ways) > 1 and _after_last(ways[tip]) == 0
-
-
-def _flange(ways: dict[str, list[Any]], last: str) -> str:
-    """Return the link that is fixed to the last rotating one, or else the rotating one itself."""
-    fixed = [
-        name for name, way in ways.items()
-        if len(way) == len(ways[last]) + 1 and way[:-1] == ways[last] and way[-1].type == "fixed"
-    ]  # fmt: skip
+def _flange(ways: dict[str, list[Any]]) -> str:
+    """Return the link that is fixed to the last of the most rotating ones; that one itself if there is none."""
+    last = max(ways, key=lambda name: (sum(map(_turns, ways[name])), bool(ways[name]) and _turns(ways[name][-1])))
+    # Fingers and cameras follow after the flange.
+    fixed = [name for name, way in ways.items() if way and way[:-1] == ways[last] and way[-1].type == "fixed"]
     return fixed[0] if fixed else last
 
 

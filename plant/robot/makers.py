@@ -167,6 +167,7 @@ _PANDA_INERTIA = (
 _PANDA_RADIUS = (0.06, 0.06, 0.06, 0.06, 0.055, 0.05, 0.045)  # [m]
 
 
+@cache
 def panda() -> Robot:
     """Return Franka's Panda, the arm with seven joints."""
     joints = tuple(f"joint_{i}" for i in range(1, 8))

@@ -31,7 +31,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.sensing import SENSOR_AXES, sensor_settings
+from servobench.plant.contract.sensing import LENGTH, SENSOR_AXES, SHARE, sensor_settings
 from servobench.plant.contract.settings import nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
@@ -290,8 +290,6 @@ def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generat
 
 
 ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
-LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-SHARE = {"%": 1e-2, "": 1.0}
 PIXELS = {"px": 1.0}
 MAX_SIZE = {"deg": math.pi, "mm": 1.0, "px": 1000.0}  # [rad, m, px] by the first unit of each kind
 AXES = {

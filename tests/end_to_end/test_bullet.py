@@ -17,7 +17,7 @@ from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.bullet import BulletSimulation
 from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
 from servobench.plant.rendered.engine import Machine
-from servobench.plant.rendered.plants import build_bullet
+from servobench.plant.rendered.plants import BULLET
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_loading_leaves_no_files_behind_even_when_it_fails(open_plant, tmp_path,
 
 def test_closing_disconnects_and_may_be_repeated():
     before = [pybullet.isConnected(client) for client in range(20)]
-    plant = build_bullet(BARE, PlantSetup(MODEL, HOME, 0.05))
+    plant = BULLET.build(BARE, PlantSetup(MODEL, HOME, 0.05))
     assert [pybullet.isConnected(client) for client in range(20)] != before
     plant.close()
     plant.close()
@@ -53,7 +53,7 @@ def test_closing_disconnects_and_may_be_repeated():
 def test_motion_under_torques_is_that_of_pybullets_own_engine():
     drives, stops, h, q = DriveConfig(payload=1.0, assumed_payload=0.0), np.full(6, np.pi), PHYSICS_STEP, HOME
     mechanics = BulletSimulation(Machine(MODEL.arm, UR5, (), drives, 0.0, HOME, (-stops, stops)))
-    client, arm, joints, v = mechanics._client, mechanics._arm, list(range(6)), np.zeros(6)
+    client, arm, joints, v = mechanics._world.client, mechanics._arm, list(range(6)), np.zeros(6)
     torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)
     pybullet.setJointMotorControlArray(arm, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client)

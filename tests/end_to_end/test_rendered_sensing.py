@@ -9,10 +9,11 @@ from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import detectors
+from servobench.plant.rendered.depth import measure_depth
 from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
 from servobench.plant.rendered.detectors import DepthCamera
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.workspace import BALL_RADIUS
 
 BOXED = RenderedConfig(obstacles=((0.45, 0.05, 0.5, 0.1, 0.1, 0.1),))
@@ -30,7 +31,7 @@ def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
         patch, tried = find_patch(rgba), tried + 1
         if patch is not None:
             true = camera.metric_depth(buffer[patch.rows, patch.columns])
-            depth = noise.apply(true, (patch.rows, patch.columns), camera, rng)
+            depth = measure_depth(noise, true, patch, camera, rng)
             found = locate_ball(patch, depth, camera, BALL_RADIUS)
             if found is not None:
                 errors.append(found.centre - MODEL.to_camera(scene.ball_position()))
@@ -39,7 +40,7 @@ def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
 
 def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre(open_scene):
     # Table and floor change no bit of what is found, as a test below shows, and cost most of the time.
-    errors, tried = errors_over_poses(open_scene, DepthNoise("none", depth_quantisation=0.0), 60)
+    errors, tried = errors_over_poses(open_scene, RenderedConfig(depth_noise="none", depth_quantisation=0.0), 60)
     distance = np.linalg.norm(errors, axis=1)
     assert np.median(distance) <= 0.0002
     assert distance.max() <= 0.001
@@ -48,15 +49,15 @@ def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre(open_scene
 
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
 def test_with_noise_the_centre_has_no_bias_of_note(open_scene, model):
-    errors, _ = errors_over_poses(open_scene, DepthNoise(model), 100)
+    errors, _ = errors_over_poses(open_scene, RenderedConfig(depth_noise=model), 100)
     assert np.abs(errors.mean(axis=0)).max() < 0.0006
     assert np.linalg.norm(errors, axis=1).max() < 0.015
 
 
 def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic(open_scene):
-    errors, _ = errors_over_poses(open_scene, DepthNoise("stereo"), 100)
+    errors, _ = errors_over_poses(open_scene, RenderedConfig(), 100)
     assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
-    white, _ = errors_over_poses(open_scene, DepthNoise("stereo", depth_patch=0.0), 100)
+    white, _ = errors_over_poses(open_scene, RenderedConfig(depth_patch=0.0), 100)
     assert (white.std(axis=0) < 0.001).all()
 
 

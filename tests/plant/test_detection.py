@@ -3,6 +3,7 @@ import colorsys
 import numpy as np
 import pytest
 
+from servobench.plant.rendered.depth import depth_deviation, measure_depth
 from servobench.plant.rendered.detection import (
     Detection,
     add_colour_noise,
@@ -12,7 +13,8 @@ from servobench.plant.rendered.detection import (
     fit_sphere,
     locate_ball,
 )
-from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.robot.camera import PinholeCamera
 
 CAMERA = PinholeCamera()
 RADIUS = 0.035
@@ -130,13 +132,10 @@ def test_an_image_without_red_and_a_speck_hold_no_ball():
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 1.25), (0.35, 0.3, 1.3)])
 def test_depth_noise_of_several_millimetres_leaves_the_centre_unbiased(centre):
     rgb, depth = ball_image(centre)
-    patch, noise, rng = find_patch(rgb), DepthNoise("stereo", depth_patch=0.0), np.random.default_rng(2)
+    patch, noise, rng = find_patch(rgb), RenderedConfig(depth_patch=0.0), np.random.default_rng(2)
     true = depth[patch.rows, patch.columns]
-    assert noise.sigma(true, CAMERA).mean() > 0.003
-    found = [
-        locate_ball(patch, noise.apply(true, (patch.rows, patch.columns), CAMERA, rng), CAMERA, RADIUS)
-        for _ in range(400)
-    ]
+    assert depth_deviation(noise, true, CAMERA).mean() > 0.003
+    found = [locate_ball(patch, measure_depth(noise, true, patch, CAMERA, rng), CAMERA, RADIUS) for _ in range(400)]
     errors = np.array([ball.centre for ball in found if ball is not None]) - centre
     assert len(errors) == 400
     # The bias is far below the scatter, and the scatter is what the fit says of itself.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.rendered.drives import DriveConfig, drives_for
-from servobench.plant.rendered.urdf import arm_urdf
+from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
 from servobench.plant.robot.catalogue import ROBOTS, find_robot, random_robot
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, nearest_title, read_calibration
@@ -130,7 +129,7 @@ def test_drives_in_proportion_to_a_ur5_are_those_of_the_ur5():
 
 def test_inertia_in_a_urdf_has_the_moments_of_its_tensor():
     robot = find_robot("panda")
-    link = ET.fromstring(arm_urdf(robot.arm, robot)).findall("link")[3]
+    link = arm_tree(robot.arm, robot).findall("link")[3]
     written = [float(link.find("inertial/inertia").get(axis)) for axis in ("ixx", "iyy", "izz")]
     np.testing.assert_allclose(written, np.linalg.eigvalsh(robot.links.inertia[2]), rtol=1e-9)
 
@@ -213,7 +212,7 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     pytest.importorskip("yourdfpy")
     own = find_robot("ur3e")
     path = tmp_path / "written.urdf"
-    path.write_text(arm_urdf(own.arm, own).replace('type="continuous">', 'type="continuous">\n'))
+    path.write_text(text(arm_tree(own.arm, own)).replace('type="continuous">', 'type="continuous">\n'))
     read = find_robot(str(path))
     postures = RNG.uniform(-3.0, 3.0, (5, 6))
     np.testing.assert_allclose(flange(read.arm, postures), flange(own.arm, postures), atol=1e-9)

@@ -5,9 +5,17 @@ import numpy as np
 import pytest
 
 from kit.plants import configure, factory_ur5, setup
-from servobench.plant.rendered.plants import build_bullet
+from servobench.plant.rendered.plants import BULLET
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.rendered.urdf import arm_mechanics, arm_urdf, bench_files, rectangles_obj, rpy_along, sphere_obj
+from servobench.plant.rendered.urdf import (
+    arm_mechanics,
+    arm_tree,
+    bench_files,
+    rectangles_obj,
+    rpy_along,
+    sphere_obj,
+    text,
+)
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot
@@ -45,7 +53,7 @@ def arm(request) -> SerialArm:
 @pytest.fixture
 def loaded(arm, tmp_path):
     """The arm in PyBullet: a function from reported joint positions to the state of a link."""
-    (tmp_path / "arm.urdf").write_text(arm_urdf(arm, UR5), encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(text(arm_tree(arm, UR5)), encoding="utf-8")
     (tmp_path / "ball.obj").write_text(sphere_obj(0), encoding="utf-8")
     client = pybullet.connect(pybullet.DIRECT)
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -103,7 +111,7 @@ def test_masses_and_inertias_arrive_in_the_simulator(loaded):
 
 def test_numbers_in_the_urdf_lose_no_digit():
     arm = perturbed_ur5()
-    origins = ET.fromstring(arm_urdf(arm, UR5)).findall("joint/origin")
+    origins = arm_tree(arm, UR5).findall("joint/origin")
     written = np.array([[float(part) for part in origin.get("xyz").split()] for origin in origins])
     np.testing.assert_array_equal(written, np.vstack([arm.translation, arm.tool]))
 
@@ -120,14 +128,14 @@ def shapes(urdf, kind) -> list[tuple[str, str, str]]:
 
 
 def test_what_is_drawn_is_what_collides(arm):
-    drawn, solid = arm_urdf(arm, UR5), arm_mechanics(arm, 1.0, robot=UR5, shapes=True)
+    drawn, solid = text(arm_tree(arm, UR5)), arm_mechanics(arm, 1.0, robot=UR5, shapes=True)
     assert shapes(drawn, "visual") == shapes(solid, "collision")
     assert shapes(drawn, "collision") == shapes(solid, "visual") == []
     assert shapes(arm_mechanics(arm, 1.0, robot=UR5, shapes=False), "collision") == []
 
 
 def test_nothing_but_the_ball_is_reddish():
-    robot = ET.fromstring(arm_urdf(ur5.ur5_arm(), UR5))
+    robot = arm_tree(ur5.ur5_arm(), UR5)
     bench = ET.fromstring(bench_files()["bench.urdf"])
     for visual in [*robot.iter("visual"), *bench.iter("visual")]:
         red, green, blue, _ = (float(part) for part in visual.find("material/color").get("rgba").split())
@@ -178,13 +186,13 @@ def test_rectangles_face_up_and_have_their_area():
 
 def test_a_period_that_physics_does_not_divide_and_a_gear_ratio_of_zero_are_refused():
     with pytest.raises(ValueError, match=r"period must be a whole multiple of the plant's own step of 0\.001 s"):
-        build_bullet(configure(RenderedConfig, latency=0.0), setup(period=0.0305))
+        BULLET.build(configure(RenderedConfig, latency=0.0), setup(period=0.0305))
     stuck = replace(UR5.nominal, arm=replace(UR5.nominal.arm, gear_ratio=np.eye(6)[0]))
     with pytest.raises(ValueError, match="gear_ratio must not be zero"):
-        build_bullet(RenderedConfig(), replace(setup(), model=stuck))
+        BULLET.build(RenderedConfig(), replace(setup(), model=stuck))
 
 
 def test_an_arm_with_another_number_of_joints_is_refused():
     arm = SerialArm(("one",), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.array([0.0, 0.0, 0.1]))
     with pytest.raises(ValueError, match="arm must have 6 joints like the UR5, got 1"):
-        arm_urdf(arm, UR5)
+        arm_tree(arm, UR5)
