@@ -14,6 +14,10 @@ from servobench.controllers.estimators.robust_filter import (
     bisquare_weight,
     irls_weight,
 )
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import carry_out_together
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 
 M, N, NOISE = 3, 4, 0.001
 
@@ -110,3 +114,22 @@ def test_the_scale_follows_noise_that_is_larger_than_configured():
         run.update(motion(dq[k], y[k] - y[k - 1]))
     assert 6.0 < run.diagnostics()["noise_scale"] < 16.0
     assert run.diagnostics()["rejected_share"] < 0.1
+
+
+@pytest.mark.slow
+def test_in_the_loop_its_jacobian_bears_40_percent_outlier_frames():
+    def jacobian_errors(estimator):
+        name = f"pid+{estimator}"
+        sections = {
+            "random": {"duration": 8.0},
+            "kinematic": {"sensing": {"outlier_size": 0.2}},
+            name: {"law": {"proportional_gain": 1.0, "damping": 0.02}},
+        }
+        requests = [RunRequest("kinematic", name, "random", "moderate+outliers=40%", seed) for seed in range(6)]
+        results = carry_out_together([resolve(request, Settings(sections)) for request in requests])
+        return np.array([result.row["jacobian_error_mean"] for result in results])
+
+    robust = jacobian_errors("robust")
+    assert np.median(robust) < 0.4
+    assert np.median(jacobian_errors("rls")) > 2.0 * np.median(robust)
+    assert np.median(jacobian_errors("kalman")) > 10.0 * np.median(robust)
