@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.statistics import (
-    CONFIDENCE,
     Estimate,
     holm,
     median_with_interval,
@@ -72,16 +71,17 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
             words += f", noise × {values['noise_factor']:g}"
         for name, (heading, factor) in varied.items():
             if name != "noise_factor" and not pd.isna(values[name]):
-                words += f", {_in_words(heading, values[name], factor)}"
+                quantity, _, unit = heading.removesuffix("]").partition(" [")
+                words += f", {quantity} {shown_value(values[name], factor)}{f' {unit}' * bool(unit)}"
         found.append((words, group))
     return found
 
 
-def _in_words(heading: str, value: Any, factor: float) -> str:  # noqa: ANN401 - a cell of the table of runs
-    """Return a value with the name and the unit of its heading, such as `latency 50 ms`."""
-    name, _, unit = heading.removesuffix("]").partition(" [")
-    shown = f"{factor * value:g}" if isinstance(value, float) else str(value)
-    return f"{name} {shown}{f' {unit}' * bool(unit)}"
+def shown_value(value: Any, factor: float = 1.0, missing: str = "as configured") -> str:  # noqa: ANN401 - a cell
+    """Return the value of a condition as text: a number times the factor to the unit in which it is shown."""
+    if pd.isna(value):
+        return missing
+    return f"{factor * value:g}" if isinstance(value, float) else str(value)
 
 
 def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs
@@ -101,14 +101,19 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
     A task of which no run could be built has no kind and is in neither.
     """
-    kinds = runs.reindex(columns=["task_kind"])["task_kind"]
+    kinds = texts_of(runs, "task_kind")
     moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"])] for kind in TASK_KINDS)
     return moves, curves
 
 
-def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
     """Return a column of the table of runs, NaN throughout where the table has none of this name."""
-    return runs.reindex(columns=[name])[name].astype(float)
+    return runs.reindex(columns=[name])[name]
+
+
+def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+    """Return a column of numbers of the table of runs, likewise."""
+    return texts_of(runs, name).astype(float)
 
 
 def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
@@ -116,19 +121,19 @@ def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
     return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
 
 
-def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+def settled_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled, in percent, with the Wilson interval."""
-    return success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence).scaled(100.0)
+    return success_rate(int(settling_times(runs).notna().sum()), len(runs)).scaled(100.0)
 
 
-def achieved_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+def achieved_share(runs: pd.DataFrame) -> Estimate:
     """Return how many of `runs` settled or followed their curve, in percent, with the Wilson interval."""
-    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs), confidence).scaled(100.0)
+    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs)).scaled(100.0)
 
 
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
-    curve = runs.reindex(columns=["task_kind"])["task_kind"] == CURVE
+    curve = texts_of(runs, "task_kind") == CURVE
     follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
     on_curve, moved = (
         np.where(follows, FOLLOWED, NOT_FOLLOWED),
@@ -136,7 +141,7 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     )
     guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
     guessed = guessed.where(runs["status"] == COMPLETED, runs["status"])
-    told = runs.reindex(columns=["outcome"])["outcome"].astype(object)
+    told = texts_of(runs, "outcome").astype(object)
     return told.where(told.notna(), guessed).rename("outcome").astype(str)
 
 
@@ -155,7 +160,7 @@ def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     metric = METRICS[name]
     if metric.unit:
         return metric.shown_unit, metric.factor
-    units = runs.reindex(columns=["feature_unit"])["feature_unit"].dropna().unique().tolist()
+    units = texts_of(runs, "feature_unit").dropna().unique().tolist()
     return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
 
 
@@ -167,7 +172,7 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
     """Return runs of several units with the errors of each in its handy one; runs of one unit as they are."""
-    units = runs.reindex(columns=["feature_unit"])["feature_unit"]
+    units = texts_of(runs, "feature_unit")
     if units.nunique() < 2:
         return runs
     handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]
@@ -193,8 +198,6 @@ def compare_pairs(
     never: float,
     metric: str = "settling_time_s",
     keys: Sequence[str] = KEYS,
-    seed: int = 0,
-    confidence: float = CONFIDENCE,
 ) -> list[Comparison]:
     """Compare controllers on the runs that they share, and correct for the number of comparisons.
 
@@ -207,8 +210,6 @@ def compare_pairs(
         never: the value of a run that has none or did not complete; for settling times the duration [s].
         metric: the column compared, less is better.
         keys: columns that two runs of a pair share.
-        seed: of the bootstrap interval of the median difference.
-        confidence: of that interval.
 
     Raises:
         ValueError: no pair, two controllers without a common run, or two runs of a controller with the same keys.
@@ -219,9 +220,7 @@ def compare_pairs(
     p_values = [signed_rank_p_value(difference) for difference in differences]
     corrected = holm(p_values)
     return [
-        Comparison(
-            *pair, median_with_interval(difference, seed=seed, confidence=confidence), p_value, float(corrected_p_value)
-        )
+        Comparison(*pair, median_with_interval(difference), p_value, corrected_p_value)
         for pair, difference, p_value, corrected_p_value in zip(pairs, differences, p_values, corrected, strict=True)
     ]
 

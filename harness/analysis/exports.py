@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -62,8 +62,8 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
 def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[Path]:
     """Write the steps of `runs`, and for CSV their table, into a new folder and return the files."""
     files = [out / "runs.csv"] if kind == CSV else []
-    for file in files:
-        runs.to_csv(file, index=False)
+    if kind == CSV:
+        runs.to_csv(files[0], index=False)
     for row in runs.to_dict("records"):
         if row["periods"] > 0:
             steps = results.load_steps(folder, [row["run_id"]])
@@ -94,7 +94,9 @@ def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> 
         writer.add_metadata("run", {str(name): str(value) for name, value in run.items()})
         channels = {}
         for topic, columns in topics.items():
-            data = json.dumps(_schema(topic, columns)).encode()
+            kinds = {name: {"type": ["number", "boolean", "null"]} for name in columns.values()}
+            properties = {"time_s": {"type": "number"}} | kinds
+            data = json.dumps({"title": topic, "type": "object", "properties": properties}).encode()
             schema = writer.register_schema(f"servobench.{topic}", "jsonschema", data)
             channels[topic] = writer.register_channel(f"/{topic}", "json", schema)
         for k, row in enumerate(steps.to_dict("records")):
@@ -107,25 +109,14 @@ def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> 
 
 
 def _topics(steps: pd.DataFrame) -> dict[str, dict[str, str]]:
-    """Return the columns of each topic with their names there; columns of no group are in `run`."""
+    """Return the columns of each topic with their names there; those that begin with no topic are in `run`."""
     grouped: dict[str, dict[str, str]] = {topic: {} for topic in (*TOPICS, "run")}
     for column in map(str, steps.columns):
         if column not in KEYS:
-            topic, name = next(_places(column), ("run", column))
-            grouped[topic][column] = name
+            begun = (topic for topic in TOPICS if column.startswith(f"{topic}_") and column != "feature_valid")
+            topic = next(begun, "run")
+            grouped[topic][column] = column.removeprefix(f"{topic}_")
     return {topic: names for topic, names in grouped.items() if names}
-
-
-def _places(column: str) -> Iterator[tuple[str, str]]:
-    """Yield the topic whose name a column begins with, and the rest of it; `feature_valid` is no feature."""
-    for topic in TOPICS:
-        if column.startswith(f"{topic}_") and column != "feature_valid":
-            yield topic, column.removeprefix(f"{topic}_")
-
-
-def _schema(topic: str, columns: Mapping[str, str]) -> dict[str, Any]:
-    kinds = {name: {"type": ["number", "boolean", "null"]} for name in columns.values()}
-    return {"title": topic, "type": "object", "properties": {"time_s": {"type": "number"}} | kinds}
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table

@@ -6,10 +6,9 @@ is about are in the group without a name.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 from servobench.controllers.methods import PUBLISHED
@@ -22,10 +21,18 @@ from servobench.harness.analysis.comparison import (
     outcomes,
     settling_times,
     shown_unit,
+    shown_value,
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
+from servobench.harness.analysis.statistics import (
+    MISSING,
+    NO_ESTIMATE,
+    Estimate,
+    median_with_interval,
+    number,
+    success_rate,
+)
 from servobench.harness.analysis.verdict import scores
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import (
@@ -85,28 +92,28 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
 
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each move how many runs settled, how fast, and with what error."""
-    runs = in_handy_units(runs)
-    return _by_task(split_tasks(runs)[0], "moves")
+    return _by_task(split_tasks(in_handy_units(runs))[0], "moves")
 
 
 def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each curve how many runs followed it, and with what error."""
-    runs = in_handy_units(runs)
-    return _by_task(split_tasks(runs)[1], "curves")
+    return _by_task(split_tasks(in_handy_units(runs))[1], "curves")
 
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the shares of outcomes [%] of each condition, task and controller of which a run failed."""
     named = runs.assign(outcome=outcomes(runs))
-    rows = [(key, own["outcome"].value_counts(), len(own)) for key, own in _rows(named, "task")]
-    mixed = [row for row in rows if not set(row[1].index) <= set(ACHIEVED)]
-    words = sorted({str(word) for _, counts, _ in mixed for word in counts.index}, key=_place_of)
+    mixed = [
+        (row, own) for row, own in _rows(named, [*_varied(runs), "task"]) if not own["outcome"].isin(ACHIEVED).all()
+    ]
+    found = {str(word) for _, own in mixed for word in own["outcome"]}
     table = []
-    for key, counts, total in mixed:
-        row: Row = key | {(WHICH, "runs"): str(total)}
-        for word in words:
-            share = success_rate(int(counts.get(word, 0)), total).scaled(100.0)
-            row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if word in counts else MISSING
+    for row, own in mixed:
+        row[WHICH, "runs"] = str(len(own))
+        for word in [*(word for word in OUTCOMES if word in found), *sorted(found - set(OUTCOMES))]:
+            count = int((own["outcome"] == word).sum())
+            share = success_rate(count, len(own)).scaled(100.0)
+            row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if count else MISSING
         table.append(row)
     return pd.DataFrame(table)
 
@@ -127,18 +134,12 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
     failed = runs[runs["status"] != COMPLETED]
     rows = []
     for (controller, plant, status), own in failed.groupby(["controller", "plant", "status"], sort=False):
-        total = len(runs[(runs["controller"] == controller) & (runs["plant"] == plant)])
+        total = ((runs["controller"] == controller) & (runs["plant"] == plant)).sum()
         first = own.iloc[0]
-        rows.append(
-            {
-                (WHICH, "controller"): str(controller),
-                (WHICH, "plant"): str(plant),
-                (WHICH, "ended by"): str(status),
-                (WHICH, "runs"): f"{len(own)} of {total}",
-                ("The first of them", "run"): str(first["run_id"]),
-                ("The first of them", "reason"): str(first.get("reason") or MISSING),
-            }
-        )
+        which = {"controller": controller, "plant": plant, "ended by": status, "runs": f"{len(own)} of {total}"}
+        example = {"run": first["run_id"], "reason": first.get("reason") or MISSING}
+        rows.append({(WHICH, name): str(text) for name, text in which.items()}
+                    | {("The first of them", name): str(text) for name, text in example.items()})  # fmt: skip
     return pd.DataFrame(rows)
 
 
@@ -150,15 +151,14 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     headings = varied_columns(runs.columns)
     for name in ("controller", "task", *_varied(runs)):
         heading, factor = headings.get(name, (name, 1.0))
-        table[WHICH, heading] = [_condition(value, factor) for value in named[name]]
+        table[WHICH, heading] = [shown_value(value, factor) for value in named[name]]
     table[WHICH, "seed"] = named["seed"].astype(str).tolist()
     for name in ("status", "outcome"):
         table["How it ended", name] = named[name].astype(str).tolist()
     for group, name in _columns("runs", runs):
         _, factor = shown_unit(name, runs)
-        table[group, metric_heading(name, runs)] = [
-            f"{Estimate(factor * value, np.nan, np.nan, 1):.{METRICS[name].digits}f}" for value in column_of(runs, name)
-        ]
+        spec = f".{METRICS[name].digits}f"
+        table[group, metric_heading(name, runs)] = [number(factor * value, spec) for value in column_of(runs, name)]
     return pd.DataFrame(table)
 
 
@@ -176,8 +176,7 @@ def _by_task(runs: pd.DataFrame, kind: str) -> dict[str, pd.DataFrame]:
 def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool) -> pd.DataFrame:
     """Return medians of measures with their intervals in groups of columns, a row for each of `keys` and controller."""
     rows = []
-    for key, own in _rows(runs, keys=keys):
-        row: Row = dict(key)
+    for row, own in _rows(runs, keys):
         if counted:
             row["Runs", "number"] = str(len(own))
             row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
@@ -188,20 +187,18 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
     return pd.DataFrame(rows)
 
 
-def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> list[tuple[Row, pd.DataFrame]]:
-    names = [*(_varied(runs) if keys is None else keys), *more]
-    order = {name: i for i, name in enumerate(ordered(runs["controller"]))}
-    headings, found = varied_columns(runs.columns), []
-    for key, own in runs.groupby([*names, "controller"], sort=False, dropna=False):
-        row: Row = {(WHICH, "controller"): str(key[-1])}
-        for name, value in zip(names, key, strict=False):
-            heading, factor = headings.get(name, (name, 1.0))
-            row[WHICH, heading] = _condition(value, factor)
-        found.append((row, own))
-    places = list(dict.fromkeys(tuple(row.values())[1:] for row, _ in found))
-    return sorted(
-        found, key=lambda pair: (places.index(tuple(pair[0].values())[1:]), order[pair[0][WHICH, "controller"]])
-    )
+def _rows(runs: pd.DataFrame, keys: Sequence[str]) -> Iterator[tuple[Row, pd.DataFrame]]:
+    """Yield the runs of each condition and controller with the cells that say which they are."""
+    names, headings = ordered(runs["controller"]), varied_columns(runs.columns)
+    for key, place in runs.groupby(list(keys), sort=False, dropna=False) if keys else [((), runs)]:
+        for name in names:
+            own = place[place["controller"] == name]
+            if len(own):
+                row: Row = {(WHICH, "controller"): name}
+                for column, value in zip(keys, key, strict=True):
+                    heading, factor = headings.get(column, (column, 1.0))
+                    row[WHICH, heading] = shown_value(value, factor)
+                yield row, own
 
 
 def _varied(runs: pd.DataFrame) -> list[str]:
@@ -228,17 +225,7 @@ def _median(own: pd.DataFrame, name: str, factor: float) -> Estimate:
     return median_with_interval(values, missing="left_out") if values.notna().any() else NO_ESTIMATE
 
 
-def _condition(value: Any, factor: float) -> str:  # noqa: ANN401 - a name or a number, or nothing
-    if pd.isna(value):
-        return "as configured"
-    return f"{factor * float(value):g}" if isinstance(value, float | np.floating) else str(value)
-
-
 def _kind_of(word: str) -> str:
     if word in ACHIEVED:
         return "As asked"
     return "Reached the last period" if word in OUTCOMES else "Ended early"
-
-
-def _place_of(word: str) -> tuple[int, str]:
-    return (OUTCOMES.index(word), "") if word in OUTCOMES else (len(OUTCOMES), word)

@@ -1,7 +1,7 @@
 """How sure a number is: rates, medians and tails with intervals, and tests of paired differences.
 
-All functions are pure, and seeded where they draw. In `median_with_interval` and `tail_mean` a missing value counts as
-+∞ unless it is left out: so does a median where half of the values or more are missing.
+All functions are pure. In `median_with_interval` and `tail_mean` a missing value counts as +∞ unless it is left out: so
+does a median where half of the values or more are missing. Intervals hold 95 %.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Estimate:
 NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
 
 
-def success_rate(successes: int, runs: int, confidence: float = CONFIDENCE) -> Estimate:
+def success_rate(successes: int, runs: int) -> Estimate:
     """Return the share of successes with its Wilson interval.
 
     Raises:
@@ -71,18 +71,11 @@ def success_rate(successes: int, runs: int, confidence: float = CONFIDENCE) -> E
     if not 0 <= successes <= runs or runs < 1:
         raise ValueError(f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}")
     with np.errstate(under="ignore"):  # scipy also takes a p-value, however small
-        interval = stats.binomtest(successes, runs).proportion_ci(confidence, method="wilson")
+        interval = stats.binomtest(successes, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(successes / runs, float(interval.low), float(interval.high), runs)
 
 
-def median_with_interval(
-    values: ArrayLike,
-    *,
-    missing: Literal["infinite", "left_out"] = "infinite",
-    seed: int = 0,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-) -> Estimate:
+def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "left_out"] = "infinite") -> Estimate:
     """Return the median with its percentile bootstrap interval.
 
     BCa is not used: its jackknife is degenerate for a median. The interval may reach to +∞, and does where that many
@@ -91,47 +84,45 @@ def median_with_interval(
     Args:
         values: a sample, NaN where a run has no value.
         missing: NaN counts as +∞ (never settled), or is left out (the metric does not apply).
-        seed: of the resampling.
-        confidence: of the interval.
-        resamples: how many.
 
     Raises:
         ValueError: no value, or −∞.
     """
     from scipy import stats  # noqa: PLC0415 - as above
 
-    sample = _sample(values, missing)
+    given = np.asarray(values, dtype=np.float64).ravel()
+    sample = _sample(given[~np.isnan(given)] if missing == "left_out" else given)
     if len(sample) == 0:
         raise ValueError("values must hold at least one number")
     finite = np.isfinite(sample)
-    if not finite.all():  # stand-ins above all finite values keep the order; a mean with one of them lies above, too
-        largest = float(sample[finite].max()) if finite.any() else 0.0
-        spread = float(np.ptp(sample[finite])) if finite.any() else 0.0
-        sample = np.where(finite, sample, largest + 2.0 * (1.0 + spread))
-    else:
-        largest = float(sample.max())
+    known = sample[finite] if finite.any() else np.zeros(1)
+    largest = float(known.max())
+
+    def restored(medians: FloatArray) -> FloatArray:
+        return np.where(medians > largest, np.inf, medians)
+
+    # Stand-ins above all finite values keep the order; a mean with one of them lies above, too.
+    sample = np.where(finite, sample, largest + 2.0 * (1.0 + float(np.ptp(known))))
+    value = float(restored(np.median(sample, keepdims=True))[0])
     if len(sample) == 1:
-        return Estimate(float(_restored(sample, largest)[0]), np.nan, np.nan, 1)
+        return Estimate(value, np.nan, np.nan, 1)
     with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
         drawn = stats.bootstrap(
-            (sample,), np.median, n_resamples=resamples, method="percentile", rng=np.random.default_rng(seed)
+            (sample,), np.median, n_resamples=RESAMPLES, method="percentile", rng=np.random.default_rng(0)
         ).bootstrap_distribution
-    medians = _restored(np.sort(drawn), largest)
-    cut = int((1.0 - confidence) / 2.0 * resamples)  # order statistics, as nothing lies between a number and infinity
-    value = float(_restored(np.array([np.median(sample)]), largest)[0])
+    medians = restored(np.sort(drawn))
+    cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)  # order statistics, as nothing lies between a number and infinity
     return Estimate(value, float(medians[cut]), float(medians[-1 - cut]), len(sample))
 
 
-def tail_mean(
-    values: ArrayLike, level: float = 0.95, *, missing: Literal["infinite", "left_out"] = "infinite"
-) -> float:
+def tail_mean(values: ArrayLike, level: float = 0.95) -> float:
     """Return the conditional value at risk: the mean of the worst share 1 − `level` of a sample of errors.
 
     The share need not be a whole number of values: the one at its edge counts in part (Rockafellar and Uryasev, 2002).
     """
     if not 0.0 <= level < 1.0:
         raise ValueError(f"level must be at least 0 and below 1, got {level}")
-    sample = np.sort(_sample(values, missing))[::-1]
+    sample = np.sort(_sample(values))[::-1]
     if len(sample) == 0:
         raise ValueError("values must hold at least one number")
     if np.isinf(sample[0]):
@@ -164,14 +155,9 @@ def signed_rank_p_value(differences: ArrayLike) -> float:
     return float(stats.wilcoxon(np.round(difference / largest, 9), zero_method="pratt").pvalue)
 
 
-def _sample(values: ArrayLike, missing: Literal["infinite", "left_out"]) -> FloatArray:
+def _sample(values: ArrayLike) -> FloatArray:
+    """Return a sample with +∞ in place of NaN."""
     sample = np.array(values, dtype=np.float64).ravel()
     if np.isneginf(sample).any():
         raise ValueError("values must not be −∞")
-    unknown = np.isnan(sample)
-    return np.where(unknown, np.inf, sample) if missing == "infinite" else sample[~unknown]
-
-
-def _restored(values: FloatArray, largest: float) -> FloatArray:
-    """Return `values` with +∞ for all that lie above the largest finite one of the sample."""
-    return np.where(values > largest, np.inf, values)
+    return np.where(np.isnan(sample), np.inf, sample)

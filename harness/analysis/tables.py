@@ -24,6 +24,7 @@ from servobench.harness.analysis.comparison import (
     settling_band,
     settling_times,
     shown_unit,
+    shown_value,
     split_conditions,
     split_tasks,
     with_places,
@@ -35,7 +36,7 @@ from servobench.harness.analysis.statistics import (
     median_with_interval,
     tail_mean,
 )
-from servobench.harness.run.metrics import METRICS, Summary
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
 from servobench.harness.run.request import SECTIONS, SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
@@ -62,7 +63,6 @@ SWEEP_COLUMNS: Final = (
 )  # columns that `sweep_tables` and `outcome_legend` read
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
-SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
 
 
 @dataclass(frozen=True)
@@ -194,11 +194,15 @@ def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
-        kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        kind = (
+            CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        )  # its own metrics stand before the common ones
+        summaries = [(column, metric.summary) for wanted in (kind, None) for column, metric in METRICS.items()
+                     if metric.summary and metric.summary.kind == wanted]  # fmt: skip
         rows = []
         for name, own in place.groupby("controller", sort=False):
             row = {"controller": str(name), "outcome": _shares(own)}
-            for column, summary in _summaries(kind):
+            for column, summary in summaries:
                 unit, factor = shown_unit(column, place)
                 heading = summary.heading if unit == "1" else f"{summary.heading}\n{unit}"
                 row[heading] = _middle(own, column, factor, summary.digits)
@@ -206,12 +210,6 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
                     row[heading] += LATE
             rows.append(row)
         yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
-
-
-def _summaries(kind: str) -> list[tuple[str, Summary]]:
-    """Return the metrics of the summary of a kind of task, those of this kind only before those of all tasks."""
-    known = [(name, metric.summary) for name, metric in METRICS.items() if metric.summary]
-    return [pair for pair in known if pair[1].kind == kind] + [pair for pair in known if pair[1].kind is None]
 
 
 def _shares(runs: pd.DataFrame) -> str:
@@ -233,7 +231,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     for part in parts:
         counted.append(_count_outcomes(part))
         curves |= set(split_tasks(part)[1]["task"])
-    keys = _sweep_keys(counted[0])
+    keys = list(counted[0].columns[:-2])
     counts = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
@@ -256,29 +254,15 @@ def _percent(value: float) -> str:
 
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return how many runs of each condition had which outcome."""
-    runs = with_places(runs).assign(
-        outcome=outcomes(runs),
-        noise=runs["noise_factor"].map("{:g}".format),
-        latency=_milliseconds(runs["latency_s"]),
-        period=_milliseconds(runs["period_s"]),
-        **{name: runs[name].map(_in_short) for name in runs.columns if name.startswith(SECTIONS)},
-    )
-    return runs.groupby([*_sweep_keys(runs), "outcome"], sort=False).size().rename("runs").reset_index()
-
-
-def _sweep_keys(runs: pd.DataFrame) -> list[str]:
-    """Return the columns that say which runs are counted together, the controller last."""
-    *keys, controller = SWEEP_KEYS
-    return [*keys, *(name for name in runs.columns if name.startswith(SECTIONS)), controller]
-
-
-def _in_short(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _milliseconds(times: pd.Series[float]) -> list[str]:
-    return [MISSING if pd.isna(time) else f"{1e3 * time:g}" for time in times]
+    """Return how many runs of each condition had which outcome: plant, task, conditions, controller, outcome, runs."""
+    varied = {name: (short.column, short.scale) for name, short in SHORT_NAMES.items()}
+    varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
+    texts = {
+        name: [shown_value(value, scale, MISSING) for value in runs[column]] for name, (column, scale) in varied.items()
+    }
+    keys = ["plant", "task", "mismatch", *varied, "controller", "outcome"]
+    named = with_places(runs).assign(outcome=outcomes(runs), **texts)
+    return named.groupby(keys, sort=False).size().rename("runs").reset_index()
 
 
 def _is_late(runs: pd.DataFrame) -> bool:

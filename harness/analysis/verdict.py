@@ -24,7 +24,7 @@ from servobench.harness.analysis.comparison import (
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.statistics import Estimate, holm, median_with_interval, signed_rank_p_value
+from servobench.harness.analysis.statistics import holm, median_with_interval, signed_rank_p_value
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
@@ -56,20 +56,17 @@ class Verdict:
 
 def judge(runs: pd.DataFrame) -> Verdict:
     """Return the result of at least one run."""
-    names = list(dict.fromkeys(runs["controller"]))
     if len(runs) == 1:
         return Verdict(_of_one_run(runs), ("One run says nothing about other seeds.",))
+    ranked = ranked_controllers(runs)
+    bounds = [str(name) for name in dict.fromkeys(runs["controller"]) if name not in ranked]
     early = int((runs["status"] != COMPLETED).sum())
     cautions = [f"{early} of {len(runs)} runs ended early."] if early else []
-    if len(names) == 1:
-        return Verdict(_of_one_controller(runs), tuple(cautions))
-    ranked = ranked_controllers(runs)
-    bounds = [name for name in names if name not in ranked]
     if bounds:
         cautions.append(f"{_listed(bounds)} {_verb(bounds, 'knows', 'know')} the true robot: shown, not ranked.")
-    if len(ranked) == 1:
-        return Verdict(_of_one_controller(runs[runs["controller"].isin(ranked)]), tuple(cautions))
     chosen = runs[runs["controller"].isin(ranked)]
+    if len(ranked) == 1:
+        return Verdict(_of_one_controller(chosen), tuple(cautions))
     return Verdict(_of_several(chosen), (_doubts(chosen), *cautions))
 
 
@@ -139,14 +136,13 @@ def shown_smaller(table: pd.DataFrame) -> set[tuple[str, str]]:
     pairs = list(combinations([str(name) for name in known.columns], 2))
     if known.empty or not pairs:
         return set()
-    corrected = holm([signed_rank_p_value(known[a] - known[b]) for a, b in pairs])
-    apart = [pair for pair, p in zip(pairs, corrected, strict=True) if p < LEVEL]
-    return {(a, b) if _signed_ranks(known[a] - known[b]) < 0.0 else (b, a) for a, b in apart}
-
-
-def _signed_ranks(differences: pd.Series[float]) -> float:
-    """Return the statistic of the signed-rank test: the sum of ranks of sizes, each with the sign of its difference."""
-    return float((np.sign(differences) * differences.abs().rank()).sum())
+    differences = {(a, b): known[a] - known[b] for a, b in pairs}
+    corrected = holm([signed_rank_p_value(difference) for difference in differences.values()])
+    return {
+        (a, b) if (np.sign(difference) * difference.abs().rank()).sum() < 0.0 else (b, a)  # the sum of signed ranks
+        for ((a, b), difference), p_value in zip(differences.items(), corrected, strict=True)
+        if p_value < LEVEL
+    }
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:
@@ -182,16 +178,13 @@ def _of_several(runs: pd.DataFrame) -> str:
     if most == 0.0:
         return f"None of the {len(shares)} controllers {asked} in any of {len(runs)} runs."
     if most == least:
+        everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
-        return f"{_all(len(shares))} {asked} in {often}{_speed(runs, best)}."
+        return f"{everyone} {asked} in {often}{_speed(runs, best)}."
     worst = [name for name, share in shares.items() if share == least]
-    top = f"{_clause(runs, best, asked)}{_speed(runs, best)}"
-    return f"{top}; least often {_listed(worst)}, in {_share(runs[runs['controller'] == worst[0]])}."
-
-
-def _clause(runs: pd.DataFrame, names: Sequence[str], asked: str) -> str:
-    each = "each " if len(names) > 1 else ""
-    return f"{_listed(names)} {each}{asked} in {_share(runs[runs['controller'] == names[0]])}"
+    first, last = (_share(runs[runs["controller"] == names[0]]) for names in (best, worst))
+    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}{_speed(runs, best)}"
+    return f"{top}; least often {_listed(worst)}, in {last}."
 
 
 def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
@@ -250,22 +243,20 @@ def _leader(words: str, place: pd.DataFrame) -> dict[tuple[str, str], Any]:
     first, second = order[:2]
     smaller = shown_smaller(table)
     rivals = [name for name in order[1:] if (first, name) not in smaller]
-    middle = {name: median_with_interval(table[name].to_numpy()) for name in (first, second)}
+
+    def median(name: str) -> str:
+        value, *interval = f"{median_with_interval(table[name].to_numpy()):.{digits}f}".split(" ", 1)
+        return " ".join([value, unit, *interval])
+
     return {
         ("", "where"): words,
         ("", "seeds"): str(len(table)),
         ("First", "controller"): first,
-        ("First", "median"): _with_unit(middle[first], unit, digits),
+        ("First", "median"): median(first),
         ("Next", "controller"): second,
-        ("Next", "median"): _with_unit(middle[second], unit, digits),
+        ("Next", "median"): median(second),
         ("How sure", RIVALS): _listed(rivals, NAMED).replace("`", "") if rivals else NOBODY,
     }
-
-
-def _with_unit(estimate: Estimate, unit: str, digits: int) -> str:
-    number = f"{estimate:.{digits}f}"
-    value, bracket, rest = number.partition(" [")
-    return f"{value} {unit}{bracket}{rest}"
 
 
 def _shares(runs: pd.DataFrame) -> dict[str, float]:
@@ -276,10 +267,6 @@ def _shares(runs: pd.DataFrame) -> dict[str, float]:
 def _share(runs: pd.DataFrame) -> str:
     good, share = int(outcomes(runs).isin(ACHIEVED).sum()), achieved_share(runs)
     return f"{good} of {len(runs)} runs (95 % interval: {share.low:.0f} to {share.high:.0f} %)"
-
-
-def _all(count: int) -> str:
-    return "Both controllers" if count == 2 else f"All {count} controllers"
 
 
 def _verb(names: Sequence[str], one: str, many: str) -> str:

@@ -12,7 +12,8 @@ import typer
 
 from servobench.harness.cli import selection
 from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, RunIdOption, Value, option
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, refuse, say
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
@@ -105,19 +106,19 @@ def _check_writable(folder: Path) -> None:
     """Refuse a folder that takes no film before a run is carried out and drawn."""
     standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     if not standing.is_dir():
-        refuse(f"{folder} cannot be written: {standing} is a file")
+        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
     if not os.access(standing, os.W_OK | os.X_OK):
-        refuse(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
+        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or carry out a new one."""
     if folder is not None:
         if given := new.given():
-            refuse(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
         return _run_of(folder, run_id)
     if run_id is not None:
-        refuse("--run names a run of a results folder, and no folder is given")
+        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
     return _carried_out(new)
 
 

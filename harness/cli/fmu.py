@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, command, option
-from servobench.harness.cli.terminal import FAILED, console, refuse, say
+from servobench.harness.cli.terminal import FAILED, console, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.fmus.compiler import Platform
     from servobench.fmus.product import Product
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
@@ -45,12 +46,10 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        from servobench.fmus.compiler import parse_platforms
-
         try:
             yield parse_platforms(self.platforms)
         except (ValueError, OSError) as error:
-            refuse(str(error))
+            raise ConfigurationError(str(error)) from error
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
@@ -101,7 +100,7 @@ def export(
 
     settings = overrides.settings()
     if controller is None and settings.sections:
-        refuse("--config and --set are for --controller; an arm has --mismatch")
+        raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     with exported.compiling() as platforms:
         if controller is None:
             product = exported.arm(fmi)
@@ -167,7 +166,7 @@ def info(file: FileArgument) -> None:
     try:
         information = read_information(file)
     except ValueError as error:
-        refuse(str(error))
+        raise ConfigurationError(str(error)) from error
     say(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
     say(f"made by {information.tool}; token {information.token}")
     sources = "; with sources" if information.has_sources else ""

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, get_type_hi
 
 import typer
 
+from servobench.harness.batch.processes import Bounds, read_size
 from servobench.harness.cli import selection
-from servobench.harness.cli.terminal import refuse
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.plan import Batch
-    from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
 ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
@@ -232,12 +232,10 @@ class Limited:
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
-        from servobench.harness.batch.processes import Bounds, read_size
-
         try:
             memory = None if self.run_memory is None else read_size(self.run_memory)
         except ValueError as error:
-            refuse(f"--run-memory: {error}")
+            raise ConfigurationError(f"--run-memory: {error}") from error
         return Bounds(self.run_timeout, memory, self.isolate)
 
 
@@ -263,11 +261,11 @@ class Running(Place):
         False
     )
 
-    def execution(self, observer: Observer | None = None) -> Execution:
+    def execution(self) -> Execution:
         """Return it as the driver takes it."""
-        from servobench.harness.batch.campaign import Execution, Observer
+        from servobench.harness.batch.campaign import Execution
 
-        return Execution(self.workers, self.scheduler, self.bounds(), self.resume, observer or Observer())
+        return Execution(self.workers, self.scheduler, self.bounds(), self.resume)
 
 
 @dataclass(frozen=True)
@@ -294,7 +292,7 @@ class Judging:
         }
         for option, value in given.items():
             if value:
-                refuse(f"--debug carries runs out one by one in this process; leave {option} away")
+                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
         return replace(how, workers=1, debug=True)
 
 

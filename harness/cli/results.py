@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli.options import JsonOption, option
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, refuse, say
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -50,7 +51,7 @@ def statistics(
     from servobench.harness.batch import results
 
     if markdown and as_json:
-        refuse("--markdown and --json are two ways to print the same; give one of them")
+        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, refuse, say
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -56,9 +56,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    how = judging.execution(running)
-    with watching(console, out, bar=not how.debug) as observer:
-        carry_out(campaign, out, replace(how, observer=observer))
+    with watching(console, out, judging.execution(running)) as how:
+        carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
@@ -93,8 +92,7 @@ def robustness(
     lines = find_lines(selection.split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
-    with watching(console, out) as observer:
-        how = running.execution(observer)
+    with watching(console, out, running.execution()) as how:
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
     say(f"the map is in {files[0]}; its runs are in {out}")
 
@@ -105,7 +103,7 @@ def claims(
     plants: options.PlantsOption = "kinematic,fmu",
     seeds: Annotated[int, option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
-        str,
+        Literal["equipped", "published", "both"],
         option(
             "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
         ),
@@ -121,7 +119,7 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.claims import find_divisions
+    from servobench.harness.studies.claims import DIVISIONS
     from servobench.harness.studies.reproduction import (
         ANSWERS,
         FIGURES,
@@ -132,10 +130,10 @@ def claims(
     )
 
     names = selection.split("plants", plants)
-    divisions = find_divisions(division)
+    divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
     wanted = None if check is None else read_answers(check)
-    with watching(console, out) as observer:
-        answers = reproduce(out, names, seeds, running.execution(observer), divisions)
+    with watching(console, out, running.execution()) as how:
+        answers = reproduce(out, names, seeds, how, divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
         verdict = answer.verdict + elsewhere(answer, answers)
@@ -195,7 +193,7 @@ def tune(
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
-        refuse(str(error))
+        raise ConfigurationError(str(error)) from error
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):

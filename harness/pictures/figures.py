@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -53,7 +53,6 @@ HEADINGS = {
 }
 OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
 OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
-T = TypeVar("T")
 
 
 class NamedFigure(NamedTuple):
@@ -83,7 +82,7 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    for group, plan in _plans(folder, results.load_runs(folder), TASKS_A_FIGURE):
+    for group, plan in _folder_plans(folder, results.load_runs(folder), TASKS_A_FIGURE):
         if (named := _carry_out(group, plan, WIDE)) is not None:
             yield named
 
@@ -99,7 +98,7 @@ def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> It
     Raises:
         ConfigurationError: not a results folder.
     """
-    for group, plan in _plans(folder, runs, 1):
+    for group, plan in _folder_plans(folder, runs, 1):
         if plan.kind in kinds:
             wide, narrow = (_carry_out(group, plan, layout) for layout in (WIDE, NARROW))
             if wide is not None and narrow is not None:
@@ -115,16 +114,11 @@ class _Plan(NamedTuple):
     draw: Callable[[Layout], Figure | None]
 
 
-def _plans(folder: Path, runs: pd.DataFrame, size: int) -> Iterator[tuple[Group, _Plan]]:
+def _folder_plans(folder: Path, runs: pd.DataFrame, size: int) -> Iterator[tuple[Group, _Plan]]:
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
     styles = method_styles(runs["controller"].tolist())
     for group in load_groups(folder, runs):
-        ensembles = load_ensembles(folder, group.runs)
-        for plan in (
-            *_move_plans(group, ensembles, styles, size),
-            *_curve_plans(group, ensembles, styles),
-            *_cost_plans(group, ensembles, styles, size),
-        ):
+        for plan in _plans(group, load_ensembles(folder, group.runs), styles, size):
             yield group, plan
 
 
@@ -154,42 +148,35 @@ def _sample(kind: str, group: Group) -> str:
     return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
 
 
-def _move_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
-    moves = group.select(point_to_point=True)
+def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
+    """Yield the figures of a group: of its moves, of its curves, and of both."""
+    moves, runs, everything = group.select(point_to_point=True), group.runs, tuple(group.tasks)
+    until = {task: shown_until(ensembles[task]) for task in everything}
     for words, part in _parts(moves, size):
-        own = {task: ensembles[task] for task in part}
-        until = {task: shown_until(own[task]) for task in part}
-        yield _Plan("errors", words, tuple(part), partial(draw_moves, own, styles))
-        yield _Plan("features", words, tuple(part), partial(draw_features, part, until, styles))
+        yield _Plan("errors", words, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
+        yield _Plan(
+            "features", words, part, partial(draw_features, {task: moves[task] for task in part}, until, styles)
+        )
     heads = divisions(name for tracks in moves.values() for name in tracks)
     for words, part in _parts(moves, max(1, size // len(heads))):
-        yield _Plan("paths", words, tuple(part), partial(draw_paths, part, styles))
-
-
-def _curve_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles) -> Iterator[_Plan]:
+        yield _Plan("paths", words, part, partial(draw_paths, {task: moves[task] for task in part}, styles))
     for task, tracks in group.select(point_to_point=False).items():
         yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
         yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
-
-
-def _cost_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
-    runs = group.runs
-    everything = tuple(group.tasks)
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
-    for words, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
-        chosen = runs[runs["task"].isin(list(measured))]
+    for words, part in _parts(runs["task"].unique() if several else (), size):
+        chosen = runs[runs["task"].isin(part)]
         for kind in FIGURES:
-            yield _Plan(kind, words, tuple(measured), partial(draw_measures, chosen, kind, styles))
+            yield _Plan(kind, words, part, partial(draw_measures, chosen, kind, styles))
     yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
-        until = shown_until(ensembles[task])
-        yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until))
+        yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until[task]))
 
 
-def _parts(tasks: Mapping[str, T], size: int) -> Iterator[tuple[str, dict[str, T]]]:
-    """Yield tasks in parts for a figure each, and words for the part where there are several."""
-    names = list(tasks)
+def _parts(tasks: Iterable[str], size: int) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield tasks in parts for a figure each, with words for the part where there are several."""
+    names = tuple(tasks)
     for first in range(0, len(names), size):
         part = names[first : first + size]
-        yield "" if len(names) <= size else "-".join(part), {name: tasks[name] for name in part}
+        yield "" if len(names) <= size else "-".join(part), part

@@ -78,7 +78,7 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     """
     paths = []
     films = [stem.with_name(f"{stem.name}.{kind}") for kind in kinds if kind != SNAPSHOTS]
-    ffmpeg = find_ffmpeg(f"--kinds {SNAPSHOTS} works without it") if films else None
+    ffmpeg = find_ffmpeg() if films else None
     if SNAPSHOTS in kinds:
         progress(0.0, "snapshots")
         with figure_style():
@@ -101,22 +101,20 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     return paths + films
 
 
-def find_ffmpeg(alternative: str) -> str:
+def find_ffmpeg() -> str:
     """Return the path of ffmpeg.
-
-    Args:
-        alternative: a remedy without it, the end of the message.
 
     Raises:
         ConfigurationError: there is none.
     """
+    remedy = f"--kinds {SNAPSHOTS} works without it"
     try:
         package: Any = import_module("imageio_ffmpeg")
         return str(package.get_ffmpeg_exe())
     except ImportError as error:
-        raise ConfigurationError(f"{missing_extra(error, 'a film')}; {alternative}") from error
+        raise ConfigurationError(f"{missing_extra(error, 'a film')}; {remedy}") from error
     except RuntimeError as error:
-        raise ConfigurationError(f"no ffmpeg for mp4 and gif, {alternative}: {error}") from error
+        raise ConfigurationError(f"no ffmpeg for mp4 and gif, {remedy}: {error}") from error
 
 
 @contextmanager

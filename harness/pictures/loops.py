@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from string import Template
 
 import matplotlib as mpl
 import numpy as np
@@ -14,20 +14,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
-from servobench.harness.analysis.loops.response import loci
+from servobench.harness.analysis.loops.systems import largest_gain, loci, sensitivity
 from servobench.harness.pictures.style import (
     Styles,
     add_legend,
+    drawing_of,
     figure_style,
     method_styles,
-    picture_of,
     plain_logarithms,
     save_figure,
 )
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_atomically
 
-PAGE = "analyse.html"
+PAGE, TEMPLATE = "analyse.html", "loops.html"
 FIGURES = "figures"
 LATENCIES: FloatArray = np.linspace(0.0, 0.5, 21)  # [s]
 FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # on the command
@@ -35,17 +35,11 @@ PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)  # M_s at the edges of the col
 NYQUIST_REACH = 2.5  # of the axes
 COLUMNS = 3
 
-CAPTIONS = {
-    "loops": "Bode, Nyquist and sensitivity at the measured feature, a line for each characteristic locus; each "
-    "feature after a step of its own reference; and the factor on the command at which the loop becomes unstable.",
-    "stability_map": "Largest sensitivity M_s over gain and latency. White: unstable. The cross is the loop as it is.",
-}
-
 
 def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
     """Draw the loops side by side."""
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
-    (magnitude, nyquist, sensitivity), (phase, step, limits) = figure.subplots(2, 3)
+    (magnitude, nyquist, peaks), (phase, step, limits) = figure.subplots(2, 3)
     for loop in loops:
         style, response = styles[loop.name], loop.response
         L, frequency = response.at_feature(), response.frequency
@@ -56,13 +50,12 @@ def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
             magnitude.plot(frequency, np.abs(curve), **look, **name)
             phase.plot(frequency, _falling_phase(curve), **look)
             nyquist.plot(curve.real, curve.imag, **(look | {"marker": ""}))
-        S = np.linalg.inv(np.eye(L.shape[-1]) + L)
-        sensitivity.plot(frequency, np.linalg.norm(S, ord=2, axis=(-2, -1)), **look)
+        peaks.plot(frequency, largest_gain(sensitivity(L)), **look)
         time = np.arange(len(loop.step)) * loop.arm.period
         for curve in loop.step.T if loop.stable else ():
             step.plot(time, curve, **style.line_arguments(len(time)))
         limits.plot(1000.0 * LATENCIES, loop.gain_limits(LATENCIES.tolist()), **style.line_arguments(len(LATENCIES)))
-    _finish_frequencies(magnitude, phase, sensitivity)
+    _finish_frequencies(magnitude, phase, peaks)
     _finish_nyquist(nyquist)
     step.set(xlabel="time [s]", ylabel="feature after a unit step", ylim=(-0.05, 1.6))
     limits.axhline(1.0, color="0.4", linewidth=0.9)
@@ -120,23 +113,13 @@ def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFr
     with figure_style():
         figures = {"loops": draw_loops(loops, styles), "stability_map": draw_stability_map(loops)}
     paths = [path for name, figure in figures.items() for path in save_figure(figure, folder / FIGURES / name)]
-    parts = [
-        "<!DOCTYPE html>",
-        '<html lang="en"><head><meta charset="utf-8"><title>servobench analyse</title>',
-        "<style>body { font: 16px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 0 auto; padding: 1.5rem; }",
-        "img { max-width: 100%; height: auto; } table { border-collapse: collapse; font-size: 14px; }",
-        "th, td { padding: .25rem .6rem; text-align: right; } th { vertical-align: bottom; }</style></head><body>",
-        "<h1>Loops around a rest</h1>",
-        table.rename(columns=lambda name: name.replace("\n", " ")).to_html(index=False, border=0),
-        f"<p>{escape(legend)}</p>",
-    ]
-    for name, figure in figures.items():
-        content, width, height = picture_of(figure)
-        data = base64.b64encode(content).decode("ascii")
-        parts.append(f'<figure><img alt="{name}" width="{width}" height="{height}" src="data:image/png;base64,{data}">')
-        parts.append(f"<figcaption>{escape(CAPTIONS[name])}</figcaption></figure>")
+    drawings = {name: drawing_of(figure)._asdict() for name, figure in figures.items()}
+    text = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8")).substitute(
+        {f"{name}_{key}": value for name, drawing in drawings.items() for key, value in drawing.items()},
+        table=table.rename(columns=lambda name: name.replace("\n", " ")).to_html(index=False, border=0),
+        legend=escape(legend),
+    )
     page = folder / PAGE
-    text = "\n".join([*parts, "</body></html>", ""])
     write_atomically(page, lambda path: path.write_text(text, encoding="utf-8"))
     return [page, *paths]
 
@@ -147,8 +130,8 @@ def _falling_phase(curve: FloatArray) -> FloatArray:
     return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
 
 
-def _finish_frequencies(magnitude: Axes, phase: Axes, sensitivity: Axes) -> None:
-    for axes in (magnitude, phase, sensitivity):
+def _finish_frequencies(magnitude: Axes, phase: Axes, peaks: Axes) -> None:
+    for axes in (magnitude, phase, peaks):
         axes.set_xscale("log")
         axes.set_xlabel("frequency [rad/s]")
     magnitude.set(ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
@@ -156,8 +139,8 @@ def _finish_frequencies(magnitude: Axes, phase: Axes, sensitivity: Axes) -> None
     plain_logarithms(magnitude)
     phase.set(ylabel="phase of the loci of L [°]", ylim=(-540.0, 0.0), yticks=range(-540, 1, 90))
     phase.axhline(-180.0, color="0.4", linewidth=0.9)
-    sensitivity.set(ylabel="largest singular value of S", ylim=(0.03, 5.0))
-    plain_logarithms(sensitivity)
+    peaks.set(ylabel="largest singular value of S", ylim=(0.03, 5.0))
+    plain_logarithms(peaks)
 
 
 def _finish_nyquist(axes: Axes) -> None:

@@ -6,7 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pandas.api.types import is_numeric_dtype
 
-from servobench.harness.analysis.comparison import settled_share, settling_times, shown_unit
+from servobench.harness.analysis.comparison import CURVE, settled_share, settling_times, shown_unit, texts_of
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.style import (
     LETTER,
@@ -28,6 +28,7 @@ from servobench.harness.pictures.style import (
     add_legend,
     label_rows,
     panel_grid,
+    plain_logarithms,
 )
 from servobench.harness.pictures.tracks import Ensembles
 from servobench.harness.run.metrics import METRICS
@@ -52,14 +53,6 @@ Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 
 
-class _Dots(NamedTuple):
-    """A measure of the table of runs as it is drawn."""
-
-    column: str
-    label: str
-    factor: float
-
-
 def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
@@ -74,9 +67,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
         layout: of the figure; a narrow one is for a single task.
     """
     rows = [
-        _dots(name, runs)
-        for name, metric in METRICS.items()
-        if metric.figure == kind and name in runs and runs[name].notna().any()
+        name for name, metric in METRICS.items() if metric.figure == kind and name in runs and runs[name].notna().any()
     ]
     if not rows:
         return None
@@ -84,7 +75,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles)
     notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
     notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
-    if rows[0].column == SETTLING and _unsettled(runs).any():
+    if _never(runs, rows[0]).any():
         notes.append("at the right edge and counted: never settled")
     if notes:
         words = textwrap.fill("; ".join(notes), round(LETTERS * layout.width))
@@ -92,7 +83,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     return figure
 
 
-def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -> Figure:
+def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles) -> Figure:
     """Draw measures of several tasks: a row a measure, a column a task."""
     tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
     height = 0.55 + LINE * max(LEAST_ROWS, len(names))
@@ -104,17 +95,17 @@ def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -
             _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
             axes.set_title(task)
             _name_rows(axes, names, WIDE)
-        part.supxlabel(row.label, fontsize=TEXT)
+        part.supxlabel(_label(row, runs), fontsize=TEXT)
     return figure
 
 
-def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
+def _draw_one_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: Layout) -> Figure:
     """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
-    rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
+    rows = [row for row in rows if row != SETTLING or _moves(runs).any()] or rows[:1]
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
     letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
-    words = [textwrap.fill(row.label, letters) for row in rows]
+    words = [textwrap.fill(_label(row, runs), letters) for row in rows]
     height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
     figure, panels = panel_grid(len(rows), height, layout, head=0.35)
     for axes, row, label in zip(panels, rows, words, strict=True):
@@ -152,9 +143,10 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
     axes = figure.add_subplot()
     top = 1.4 * max(float(np.max(values)) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
-        _draw_times(axes, i, values, limit, styles[name])
+        words = _draw_times(axes, i, values, limit, styles[name])
         if layout is WIDE:
-            _write_times(axes, i, values, limit)
+            axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
+                          fontweight="bold" if "\n" in words else None, linespacing=1.0)  # fmt: skip
     if layout is WIDE:
         axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom",
                       fontsize=TEXT - 0.5, xytext=(0, 2), textcoords="offset points")  # fmt: skip
@@ -165,31 +157,25 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
         axes.annotate(f"control period, {limit:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
-    axes.set(xscale="log", xlabel="time of a controller's step [ms]" if layout is WIDE else "time of a step [ms]")
+    plain_logarithms(axes, "x")
+    axes.set_xlabel("time of a controller's step [ms]" if layout is WIDE else "time of a step [ms]")
     axes.set_xlim(right=top)
     _name_rows(axes, list(known), layout)
-    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     return figure
 
 
-def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> None:
+def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> str:
+    """Draw the times of a controller's steps [ms] in line `i`, and return the numbers that belong beside it."""
     low, first, middle, third, high = np.percentile(values, PERCENTILES)
     axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
     axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
     axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
               markerfacecolor=style.face)  # fmt: skip
+    words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
     if values.max() > limit:
         axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
-
-
-def _write_times(axes: Axes, i: int, values: FloatArray, limit: float) -> None:
-    middle, high = np.percentile(values, (50.0, 99.0))
-    late = int(np.count_nonzero(values > limit))
-    words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
-    if late:
-        words += f"\n{late} of {len(values)} too slow"
-    axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
-                  fontweight="bold" if late else None, linespacing=1.0)  # fmt: skip
+        words += f"\n{np.count_nonzero(values > limit)} of {len(values)} too slow"
+    return words
 
 
 def _short(milliseconds: float) -> str:
@@ -197,47 +183,39 @@ def _short(milliseconds: float) -> str:
     return f"{1000.0 * milliseconds:.0f} µs" if milliseconds < 0.9995 else f"{milliseconds:.3g} ms"
 
 
-def _dots(column: str, runs: pd.DataFrame) -> _Dots:
-    unit, factor = shown_unit(column, runs)
-    name = METRICS[column].label
+def _label(column: str, runs: pd.DataFrame) -> str:
+    """Return the label of a metric with its unit; in a figure it has room for more words than in a table."""
+    unit, name = shown_unit(column, runs)[0], METRICS[column].label
     if column == "rms_error_evaluated":
         name = "RMS error of the judged part"
         name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""
     if column == "command_switches":
         name, unit = "sign switches of large commands", "count"
-    return _Dots(column, f"{name} [{unit}]", factor)
+    return f"{name} [{unit}]"
 
 
-def _unsettled(runs: pd.DataFrame) -> pd.Series[bool]:
-    """Return which moves never settled."""
-    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
-    return moves & settling_times(runs).isna()
+def _moves(runs: pd.DataFrame) -> pd.Series[bool]:
+    """Return which runs are moves; a curve has no settling time."""
+    return texts_of(runs, "task_kind") != CURVE
 
 
-def _applies(runs: pd.DataFrame, row: _Dots) -> bool:
-    """Return whether a measure says something about a task: a curve has no settling time."""
-    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
-    return bool(runs[row.column].notna().any()) and (row.column != SETTLING or bool(moves.any()))
+def _never(runs: pd.DataFrame, column: str) -> pd.Series[bool]:
+    """Return which runs have no settling time although they are moves; of other measures none."""
+    return _moves(runs) & settling_times(runs).isna() & (column == SETTLING)
 
 
-def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, row: _Dots) -> None:
+def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str) -> None:
     """Draw a measure of the runs of one task."""
-    values = row.factor * runs[row.column].astype(float)
+    values, never = shown_unit(column, runs)[1] * runs[column].astype(float), _never(runs, column)
     floor = values.max() / MAX_RANGE
     values = values.where(~((values > 0.0) & (values < floor)), floor)
-    never = _unsettled(runs) if row.column == SETTLING else pd.Series(False, runs.index)
-    values = values.where(~never)
-    if row.column == SETTLING:
-        values = values.where(runs.reindex(columns=["task_kind"])["task_kind"] != "curve")
-    largest, least = float(values.max()), float(values.min())
-    wide = least > 0.0 and largest / least > WIDE_RANGE
-    edge = largest * (NEVER if never.any() else 1.06) if largest > 0.0 else 1.0
-    if wide:
-        edge = largest * (largest / least) ** 0.08
+    if column == SETTLING:
+        values = values.where(_moves(runs) & ~never)
     if values.isna().all() and not never.any():
         axes.tick_params(axis="x", bottom=False, labelbottom=False)
         axes.text(0.5, 0.5, "does not apply", transform=axes.transAxes, ha="center", va="center", color="0.4",
                   fontsize=TEXT - 1.0)  # fmt: skip
+    edge = _limit(axes, values, NEVER if never.any() else 1.06)
     for i, name in enumerate(names):
         own, style = runs["controller"] == name, styles[name]
         for completed in (True, False):
@@ -248,20 +226,32 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
             face = style.colour if completed else "none"
             axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
                       markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
-        middle = values[own].fillna(math.inf).median() if row.column == SETTLING else values[own].median()
+        middle = values[own].fillna(math.inf).median() if column == SETTLING else values[own].median()
         if own.sum() > 1 and math.isfinite(middle):
             axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
         if never[own].any():
             axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="left", va="center", xytext=(5, 0),
                           textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
-    if wide:
-        axes.set_xscale("log")
+
+
+def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
+    """Set the range in which `values` are shown, linear or logarithmic, and return its upper end.
+
+    Args:
+        axes: where.
+        values: at least 0, NaN where there is none.
+        room: upper end over the largest value on a linear axis.
+    """
+    largest, least = float(values.max()), float(values.min())
+    if least > 0.0 and largest / least > WIDE_RANGE:
+        edge = largest * float((largest / least) ** 0.08)
+        plain_logarithms(axes, "x")
         axes.set_xlim(least / (edge / largest), edge)
-        axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-    else:
-        axes.set_xlim(0.0, edge)
-        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
+        return edge
+    edge = largest * room if largest > 0.0 else 1.0
+    axes.set_xlim(0.0, edge)
+    axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
+    return edge
 
 
 def draw_places(

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.style import DESIRED, END_MARK, LETTER, WIDE, Layout, Styles, add_legend, divisions
+from servobench.harness.pictures.style import DESIRED, LETTER, WIDE, Layout, Styles, add_legend, divisions, mark_end
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
@@ -27,7 +27,7 @@ CAMERA_FRAME: Final = {
     "y_m": "y, downwards [m]",
     "z_m": "z, depth [m]",
 }  # of a feature in the frame of the camera
-PIXELS: Final = "_px"  # at the end of a feature in an image, where the second one of a pair points down
+PIXELS: Final = "px"  # unit of a feature in an image, where the second one of a pair points down
 
 
 class View(NamedTuple):
@@ -58,7 +58,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     columns = min(COLUMNS, layout.columns, len(blocks))
     rows = -(-len(blocks) // columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
-    ratios = [max(block.extent.ratio(i) for block in line) for line in lines for i in range(len(views))]
+    ratios = [max(block.extent.ratio(view) for block in line) for line in lines for view in views]
     width = SINGLE if layout is WIDE and columns == 1 else layout.width / columns - BESIDE
     lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout is WIDE else 1.0)
     height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
@@ -66,13 +66,13 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
     for number, block in enumerate(blocks):
         row, column = divmod(number, columns)
-        for i, view in enumerate(views):
-            axes = grid[row * len(views) + i, column]
+        for i, view in enumerate(views, row * len(views)):
+            axes = grid[i, column]
             _draw_view(axes, block.tracks, styles, view)
-            block.extent.apply(axes, i, ratios[row * len(views) + i])
+            block.extent.apply(axes, view, ratios[i])
             title = f"{block.title}: {view.title}" if len(views) > 1 else block.title
             axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
-            if i + 1 < len(views) and views[i + 1].across == view.across:  # the view below has the same abscissa
+            if view is not views[-1] and views[views.index(view) + 1].across == view.across:  # one abscissa for both
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)
     for axes in grid.reshape(rows, len(views), columns).transpose(0, 2, 1).reshape(-1, len(views))[len(blocks) :].flat:
@@ -98,7 +98,7 @@ def _views(tracks: Tracks) -> list[View]:
     if features[:3] == list(CAMERA_FRAME):
         return [View("camera's view", 0, 1), View("from above", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
-    if features[0].endswith(PIXELS) and len(names) % 2 == 0:
+    if features[0].endswith(f"_{PIXELS}") and len(names) % 2 == 0:
         return [View(f"{names[i + 1]} over {names[i]}", i, i + 1) for i in range(0, min(4, len(names)), 2)]
     return [View(f"{names[i]} over {names[0]}", 0, i) for i in range(1, min(3, len(names)))]
 
@@ -107,34 +107,32 @@ class _Extent:
     """The range of the paths of a block along each of its features."""
 
     def __init__(self, tracks: Tracks, views: list[View]) -> None:
-        points = np.concatenate([_points(track, "true_feature_") for track in tracks.values()])
-        points = np.concatenate([points, _points(longest(tracks), "reference_")])
-        names = longest(tracks).features
-        self._views = views
-        self._to_scale = [names[v.across].rpartition("_")[2] == names[v.upright].rpartition("_")[2] for v in views]
-        self._in_image = names[0].endswith(PIXELS)
+        whole = longest(tracks)
+        points = np.concatenate([*(_points(track, "true_feature_") for track in tracks.values()),
+                                 _points(whole, "reference_")])  # fmt: skip
+        self._units = [name.rpartition("_")[2] for name in whole.features]
         self._middle = (points.max(axis=0) + points.min(axis=0)) / 2
         self._size = np.maximum(ROOM * np.ptp(points, axis=0), 1e-6)
-        scaled = [self._size[v.upright] / TALLEST for v, scale in zip(views, self._to_scale, strict=True) if scale]
-        self._across = max([*(float(self._size[view.across]) for view in views), *scaled])
+        tall = [float(self._size[view.upright]) / TALLEST for view in views if self._to_scale(view)]
+        self._across = max([*(float(self._size[view.across]) for view in views), *tall])
 
-    def ratio(self, i: int) -> float:
+    def _to_scale(self, view: View) -> bool:
+        return self._units[view.across] == self._units[view.upright]
+
+    def ratio(self, view: View) -> float:
         """Return height over width that a view needs."""
-        if not self._to_scale[i]:
-            return 0.6
-        return float(np.clip(self._size[self._views[i].upright] / self._across, SLIMMEST, TALLEST))
+        ratio = np.clip(self._size[view.upright] / self._across, SLIMMEST, TALLEST)
+        return float(ratio) if self._to_scale(view) else 0.6
 
-    def apply(self, axes: Axes, i: int, ratio: float) -> None:
+    def apply(self, axes: Axes, view: View, ratio: float) -> None:
         """Set the limits of a view whose height over width is given; lengths have the same scale both ways."""
-        view = self._views[i]
-        middle, half = self._middle[view.across], self._across / 2
-        axes.set_xlim(middle - half, middle + half)
-        middle = self._middle[view.upright]
-        half = ratio * self._across / 2 if self._to_scale[i] else self._size[view.upright] / 2
-        axes.set_ylim(middle - half, middle + half)
-        if self._to_scale[i]:
+        to_scale, half = self._to_scale(view), self._across / 2
+        high = ratio * half if to_scale else self._size[view.upright] / 2
+        x, y = self._middle[view.across], self._middle[view.upright]
+        axes.set(xlim=(x - half, x + half), ylim=(y - high, y + high))
+        if to_scale:
             axes.set_aspect("equal", adjustable="box")
-        if axes.get_ylabel() == CAMERA_FRAME["y_m"] or self._in_image:
+        if axes.get_ylabel() == CAMERA_FRAME["y_m"] or self._units[0] == PIXELS:
             axes.invert_yaxis()
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
         axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
@@ -152,7 +150,7 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
         if len(points):
             axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
             if not track.completed:
-                axes.plot(*points[-1:].T, color=styles[name].colour, **END_MARK)
+                mark_end(axes, points[:, 0], points[:, 1], styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
     axes.plot(*start.T, color="black", marker="s", markersize=6, markerfacecolor="white", markeredgewidth=1.3,
               linestyle="", label="start", zorder=10)  # fmt: skip

@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
-from servobench.harness.pictures.tracks import Track
+from servobench.harness.pictures.tracks import Track, track_of
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -91,9 +91,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         raise ConfigurationError(f"run {run_id} cannot be shown: films have the sensing position, not {sensing}")
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
-    track = Track(row, steps.reset_index(drop=True))
+    track = track_of(row, steps)
     robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
-    names = [str(name) for name in steps if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
+    names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
     if len(names) != robot.arm.n:
         raise ConfigurationError(
             f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
@@ -104,7 +104,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
     except (ValueError, TypeError) as error:
         raise ConfigurationError(f"run {run_id}: settings of the camera in the manifest: {error}") from error
-    q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
+    q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
     def in_base(points: FloatArray) -> FloatArray:
@@ -139,7 +139,7 @@ def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
     )
 
 
-class Replay:
+class Replay(AbstractContextManager["Replay"]):
     """The scene in which a logged run is shown; to be used in a `with` statement."""
 
     def __init__(self, run: LoggedRun, *, fineness: float = 1.0) -> None:
@@ -157,11 +157,7 @@ class Replay:
         self._pose = self._poses[0]
         self._overview = Overview.of(run.robot.workspace.scale, fineness)
 
-    def __enter__(self) -> Self:
-        """Return the replay."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the world."""
         self._scene.close()
 

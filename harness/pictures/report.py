@@ -11,7 +11,6 @@ import base64
 import hashlib
 import re
 from collections.abc import Iterator
-from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -32,6 +31,7 @@ from servobench.harness.analysis.comparison import (
     settling_band,
     shown_unit,
     split_tasks,
+    texts_of,
 )
 from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
 from servobench.harness.analysis.statistics import MISSING
@@ -44,13 +44,13 @@ from servobench.harness.pictures.style import (
     NARROW,
     TEXT,
     WIDE,
-    Layout,
+    Drawing,
     MethodStyle,
+    drawing_of,
     figure_style,
     method_styles,
-    picture_of,
 )
-from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, longest
+from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, load_tables, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.request import varied_columns
@@ -85,14 +85,6 @@ CONTROLLER: Final = (groups.WHICH, "controller")
 INFINITE: Final = "∞"
 LENGTHY: Final = 24  # letters of a word that may be broken anywhere
 FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
-
-
-class Drawing(NamedTuple):
-    """A figure as a file, with the size [px] at which its type is as large as that of the page."""
-
-    data: str  # the PNG file, base64
-    width: int
-    height: int
 
 
 class Picture(NamedTuple):
@@ -147,69 +139,22 @@ def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
         wide, narrow = (draw_conditions(split_tasks(runs)[0], styles, layout) for layout in (WIDE, NARROW))
     if wide is not None and narrow is not None:
         title = "Share of moves that settle over each condition, all others together; bands are 95 % intervals"
-        yield Picture("conditions", title, (), _drawing(wide, WIDE), _drawing(narrow, NARROW))
+        yield _picture("conditions", title, (), wide, narrow)
     for named, slim in page_figures(folder, runs, KINDS):
-        drawings = _drawing(named.figure, WIDE), _drawing(slim.figure, NARROW)
-        yield Picture(named.kind, named.title, named.tasks, *drawings)
+        yield _picture(named.kind, named.title, named.tasks, named.figure, slim.figure)
 
 
-def _drawing(figure: Figure, layout: Layout) -> Drawing:
-    figure.suptitle("")  # the page has it as a caption
-    content, width, height = picture_of(figure, layout)
-    return Drawing(base64.b64encode(content).decode("ascii"), width, height)
+def _picture(kind: str, title: str, tasks: tuple[str, ...], wide: Figure, narrow: Figure) -> Picture:
+    for figure in (wide, narrow):
+        figure.suptitle("")  # the page has it as a caption
+    return Picture(kind, title, tasks, drawing_of(wide, WIDE), drawing_of(narrow, NARROW))
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
-    views = path_views(folder, runs)
-    shown = _shown(runs)
-    numbered = groups.runs_table(shown)
-    numbered.insert(0, (groups.WHICH, "run"), shown.index.to_list())
+    views, shown = path_views(folder, runs), _shown(runs)
     style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
-    pictures = report_pictures(folder, runs)
-    moves, curves, ended = groups.move_tables(runs), groups.curve_tables(runs), groups.outcome_table(runs)
-    others = [(name, table.map(lambda value: value)) for name, table in other_tables(folder)]
-    estimates = any(picture.kind == "jacobian" for picture in pictures)
-    sections = {"result": True, "outcomes": True, "moves": moves, "curves": curves, "space": views,
-                "estimates": estimates, "cost": True, "runs": True, "others": others, "origin": True}  # fmt: skip
-    facts = describe_folder(folder, runs)
-    return _environment().get_template(TEMPLATE).render(
-        folder=folder.resolve().name,
-        policy=_policy(style, scripts),
-        style=Markup(style),
-        scripts=[Markup(script) for script in scripts],
-        sections=[name for name, content in sections.items() if content],
-        tasks={name: [] for name in sections} | {"moves": list(moves), "curves": list(curves)},
-        sheet=sheet,
-        long_table=LONG_TABLE,
-        missing=results.describe_missing(folder),
-        verdict=judge(runs),
-        scope=_scope(runs, facts),
-        band=settling_band(runs),
-        following=settling_band(runs, FOLLOWING_BANDS),
-        overview=groups.overview(runs),
-        published=runs["controller"].str.endswith(PUBLISHED).any(),
-        leaders=leaders(runs),
-        moves=moves,
-        curves=curves,
-        outcomes=ended,
-        meanings=groups.meanings(ended),
-        failures=groups.failure_table(runs),
-        pictures=pictures,
-        views=views,
-        estimates=estimates,
-        costs=groups.cost_table(runs),
-        runs=numbered,
-        shown=len(shown),
-        hidden=len(runs) - len(shown),
-        others=others,
-        facts=facts,
-        settings=describe_settings(folder),
-        data=_data(folder, shown, views),
-    )  # fmt: skip
-
-
-@cache
-def _environment() -> Environment:
+    numbered, facts = groups.runs_table(shown), describe_folder(folder, runs)
+    numbered.insert(0, (groups.WHICH, "run"), shown.index.to_list())
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -217,8 +162,30 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"breakable": breakable, "marked": marked}
-    return environment
+    environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
+    return environment.get_template(TEMPLATE).render(
+        folder=folder.resolve().name,
+        policy=_policy(style, scripts),
+        style=Markup(style),
+        scripts=[Markup(script) for script in scripts],
+        groups=groups,
+        long_table=LONG_TABLE,
+        missing=results.describe_missing(folder),
+        verdict=judge(runs),
+        leaders=leaders(runs),
+        scope=_scope(runs, facts),
+        band=settling_band(runs),
+        following=settling_band(runs, FOLLOWING_BANDS),
+        published=PUBLISHED,
+        pictures=report_pictures(folder, runs),
+        views=views,
+        runs=runs,
+        numbered=numbered,
+        others=list(other_tables(folder)),
+        facts=facts,
+        settings=describe_settings(folder),
+        data=_data(folder, shown, views),
+    )
 
 
 def _asset(name: str) -> str:
@@ -227,15 +194,13 @@ def _asset(name: str) -> str:
 
 def _policy(style: str, scripts: list[str]) -> str:
     """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
-    styles, own = _digests([style]), _digests(scripts)
-    return (
-        f"default-src 'none'; img-src data:; style-src {styles}; script-src {own}; base-uri 'none'; form-action 'none'"
-    )
 
+    def digests(texts: list[str]) -> str:
+        found = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
+        return " ".join(f"'sha256-{digest}'" for digest in found)
 
-def _digests(texts: list[str]) -> str:
-    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
-    return " ".join(f"'sha256-{digest}'" for digest in digests)
+    own = f"style-src {digests([style])}; script-src {digests(scripts)}"
+    return f"default-src 'none'; img-src data:; {own}; base-uri 'none'; form-action 'none'"
 
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
@@ -285,14 +250,12 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
         "measures": [metric_heading(name, shown) for name in known],
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
-        "swatches": swatches([str(name) for name in dict.fromkeys(shown["controller"])]),
+        "swatches": {
+            name: {"colour": style.colour, "dash": _dash(style)}
+            for name, style in method_styles(shown["controller"].astype(str)).items()
+        },
         "views": views,
     }
-
-
-def swatches(names: list[str]) -> dict[str, Json]:
-    """Return colour and dashes of each controller's line as the page draws it."""
-    return {name: {"colour": style.colour, "dash": _dash(style)} for name, style in method_styles(names).items()}
 
 
 def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
@@ -324,35 +287,25 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
     points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
     curves: dict[str, Json] = {}
-    units = dict(zip(wanted["run_id"], wanted.reindex(columns=["feature_unit"])["feature_unit"], strict=True))
-    for run_id, steps in _steps(folder, wanted["run_id"].tolist()):
-        unit, factor = handy_unit(units[run_id])
-        bins = np.array_split(factor * steps["error_norm"].to_numpy(dtype=np.float64), min(points, len(steps)))
-        curves[run_id] = {
-            "end": rounded(float(steps["time_s"].iloc[-1])),
-            "unit": unit,
-            "error": [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins],
-        }
+    for first in range(0, len(wanted), STEPS_AT_ONCE) if results.has_steps(folder) else ():
+        part = wanted[first : first + STEPS_AT_ONCE]
+        tables = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
+        for run_id, feature_unit in zip(part["run_id"], texts_of(part, "feature_unit"), strict=True):
+            if run_id in tables:
+                curves[run_id] = _curve(tables[run_id], feature_unit, points)
     return curves
+
+
+def _curve(steps: pd.DataFrame, feature_unit: str | None, points: int) -> Json:
+    unit, factor = handy_unit(feature_unit)
+    bins = np.array_split(factor * steps["error_norm"].to_numpy(dtype=np.float64), min(points, len(steps)))
+    error = [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins]
+    return {"end": rounded(float(steps["time_s"].iloc[-1])), "unit": unit, "error": error}
 
 
 def rounded(value: float, digits: int = DIGITS) -> float | None:
     """Return a number with few digits for JSON, None where it is not finite."""
     return float(f"{value:.{digits}g}") if np.isfinite(value) else None
-
-
-def _steps(folder: Path, run_ids: list[str]) -> Iterator[tuple[str, pd.DataFrame]]:
-    if not results.has_steps(folder):
-        return
-    for first in range(0, len(run_ids), STEPS_AT_ONCE):
-        try:
-            steps = results.load_steps(
-                folder, run_ids[first : first + STEPS_AT_ONCE], ["run_id", "time_s", "error_norm"]
-            )
-        except ConfigurationError:  # each of these runs ended before its first period
-            continue
-        for run_id, own in steps.groupby("run_id", sort=False):
-            yield str(run_id), own
 
 
 def _view(title: str, tracks: Tracks) -> Json:
@@ -389,7 +342,6 @@ class Cell(NamedTuple):
     text: str
     interval: str = ""  # of the number; empty without one
     number: bool = False  # whether it is to be read as a number
-    link: str = ""  # address within the page; empty without one
 
     @property
     def lengthy(self) -> bool:
@@ -397,54 +349,40 @@ class Cell(NamedTuple):
         return any(len(word) > LENGTHY for word in BREAKS.sub(" ", self.text).split())
 
 
-class SheetRow(NamedTuple):
-    """A row of cells."""
-
-    cells: list[Cell]  # one a column
-    begins: bool  # whether another method begins with it
-    published: bool  # whether it is a method as published
-    name: str = ""  # identifier of the row in the page; empty without one
-
-
 class Sheet(NamedTuple):
-    """A table."""
+    """The columns of a table."""
 
     groups: list[tuple[str, int]]  # title and number of columns of each group of columns; empty without groups
     headings: list[tuple[str, str]]  # of each column: name, unit
-    rows: list[SheetRow]
     size: str  # `few`, `some` or `many` columns, for the width at which rows become cards
     pairs: bool  # whether every group has two columns, which stay side by side in a card
+    controller: int | None  # the column with the controller's name, if there is one
 
 
-def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:
-    """Return a table for the template.
-
-    Args:
-        table: its columns are headings or pairs (group, heading).
-        linked: the first column counts runs: its cells link to `#run-<number>`.
-    """
-    columns = [
-        (str(name[0]), str(name[1])) if isinstance(name, tuple) else (groups.WHICH, str(name)) for name in list(table)
-    ]
-    spans = [(name, len(list(own))) for name, own in groupby(group for group, _ in columns)]
-    headings = [_heading(heading) for _, heading in columns]
+def sheet(table: pd.DataFrame) -> Sheet:
+    """Return the columns of a table, which are headings or pairs (group, heading)."""
+    columns = [name if isinstance(name, tuple) else (groups.WHICH, str(name)) for name in table]
+    spans = [(group, len(list(own))) for group, own in groupby(str(group) for group, _ in columns)]
+    units = [str(heading).partition(" [") for _, heading in columns]
     size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"
-    pairs = len(spans) > 1 and [count for _, count in spans] == [1, *[2] * (len(spans) - 1)]
-    rows = list(_rows(table, columns, linked=linked))
-    return Sheet(spans if len(spans) > 1 else [], headings, rows, size, pairs)
-
-
-def breakable(text: object) -> Markup:
-    """Return escaped text that may be broken after signs such as `_` and `:`."""
-    return Markup("<wbr>").join(escape(part) for part in BREAKS.sub("\\1\0", str(text)).split("\0"))
-
-
-def marked(text: object) -> Markup:
-    """Return escaped text in which words between backticks are set as code."""
-    return Markup("").join(
-        Markup("<code>{}</code>").format(part) if i % 2 else escape(part)
-        for i, part in enumerate(TICKED.split(str(text)))
+    return Sheet(
+        spans if len(spans) > 1 else [],
+        [(name, unit.removesuffix("]")) for name, _, unit in units],
+        size,
+        len(spans) > 1 and [count for _, count in spans] == [1, *[2] * (len(spans) - 1)],
+        columns.index(CONTROLLER) if CONTROLLER in columns else None,
     )
+
+
+def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
+    """Return a value as the page shows it, with its interval apart."""
+    text = plain(value)
+    match = ESTIMATE.fullmatch(text)
+    if match is None:
+        return Cell(text, number=NUMBER.match(text) is not None)
+    if {match["value"][0], match["low"], match["high"]} == {INFINITE}:  # an interval from ∞ to ∞ says nothing
+        return Cell(INFINITE, number=True)
+    return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)
 
 
 def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
@@ -460,29 +398,14 @@ def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
     return str(value)
 
 
-def _rows(table: pd.DataFrame, columns: list[tuple[str, str]], *, linked: bool) -> Iterator[SheetRow]:
-    place = columns.index(CONTROLLER) if CONTROLLER in columns else None
-    before = None
-    for values in table.itertuples(index=False, name=None):
-        cells = [_cell(plain(value)) for value in values]
-        owner = None if place is None else str(values[place])
-        method = None if owner is None else owner.removesuffix(PUBLISHED)
-        name = f"run-{values[0]}" if linked else ""
-        if linked:
-            cells[0] = Cell(cells[0].text, number=True, link=f"#{name}")
-        yield SheetRow(cells, method != before, bool(owner and owner.endswith(PUBLISHED)), name)
-        before = method
+def breakable(text: object) -> Markup:
+    """Return escaped text that may be broken after signs such as `_` and `:`."""
+    return Markup("<wbr>").join(escape(part) for part in BREAKS.sub("\\1\0", str(text)).split("\0"))
 
 
-def _cell(text: str) -> Cell:
-    match = ESTIMATE.fullmatch(text)
-    if match and {match["value"][0], match["low"], match["high"]} == {INFINITE}:  # an interval from ∞ to ∞ says nothing
-        return Cell(INFINITE, number=True)
-    if match:
-        return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)
-    return Cell(text, number=NUMBER.match(text) is not None)
-
-
-def _heading(text: str) -> tuple[str, str]:
-    name, bracket, unit = text.partition(" [")
-    return name, unit.removesuffix("]") if bracket else ""
+def marked(text: object) -> Markup:
+    """Return escaped text in which words between backticks are set as code."""
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part)
+        for i, part in enumerate(TICKED.split(str(text)))
+    )

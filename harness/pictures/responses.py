@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,23 +21,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.style import (
-    BLACK,
-    BLUE,
     CAMERA_MOVES,
     DESIRED,
-    END_MARK,
-    GREEN,
-    ORANGE,
-    PURPLE,
+    JOINTS,
     SETTLED,
-    SKY,
     TEXT,
-    VERMILION,
     WIDE,
     Layout,
     Styles,
     add_legend,
     divisions,
+    finish_columns,
+    label_rows,
+    mark_end,
+    panel_grid,
     plain_logarithms,
 )
 from servobench.harness.pictures.tracks import (
@@ -44,6 +42,7 @@ from servobench.harness.pictures.tracks import (
     WINDOW,
     Ensemble,
     Ensembles,
+    Shown,
     Track,
     Tracks,
     each,
@@ -58,17 +57,12 @@ COLUMNS: Final = 2
 LINE: Final = 0.17  # [in] of the legend
 DrawPanel = Callable[[Axes, Ensembles, Styles], None]
 COMMAND: Final = "joint_velocity_command_"
-JOINTS: Final = (
-    (BLUE, "-"),
-    (VERMILION, (0, (4, 1))),
-    (GREEN, "-."),
-    (ORANGE, (0, (6, 1, 1, 1))),
-    (PURPLE, (0, (2, 1))),
-    (SKY, "-"),
-    (BLACK, ":"),
-)  # colours and lines of joints in their order
 ROW: Final = 0.72  # [in] a controller
-QUANTITIES: Final = ("joint speed [rad/s]", "acceleration [rad/s²]", "jerk [rad/s³]")
+QUANTITIES: Final = (
+    ("joint speed [rad/s]", "command_switches", "{:.0f} sign switches"),
+    ("acceleration [rad/s²]", "joint_acceleration_rms_rad_s2", "RMS {:.3g}"),
+    ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
+)  # a column of panels each: its title, the metric written into it, and its form
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
 FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
 OUTSIDE: Final = 1e12  # of every picture
@@ -82,9 +76,7 @@ def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = 
     settled.
     """
     figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
-    low, high = error_limits([ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
-    if high > 0.0:
-        panels[0][0].set_ylim(low if low > 0.0 else None, high)
+    show_errors(panels[0][0], [ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
     for axes, task in panels:
         until, end = shown_until(tasks[task]), max(float(own.time[-1]) for own in tasks[task].values())
         if until < end:
@@ -125,10 +117,7 @@ def draw_features(
         column[-1].set_xlabel("time [s]")
         if until[task] < longest(tracks).time[-1]:
             column[-1].set_xlim(-0.02 * until[task], until[task])
-    for axes in panels[:, 1:].ravel():
-        axes.set_ylabel("")
-    figure.align_ylabels(panels[:, 0])
-    add_legend(figure, panels.ravel())
+    finish_columns(figure, panels)
     return figure
 
 
@@ -161,10 +150,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
         column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
         if long:
             column[0].set_xlabel("time [s]")
-    for axes in panels[:, 1:].ravel():
-        axes.set_ylabel("")
-    figure.align_ylabels(panels[:, 0])
-    add_legend(figure, panels.ravel())
+    finish_columns(figure, panels)
     return figure
 
 
@@ -177,24 +163,16 @@ def _draw_tasks(
         for task, ensembles in tasks.items()
         for head, names in divisions(ensembles).items()
     ]
-    columns = min(COLUMNS, layout.columns, len(cells))
-    rows = -(-len(cells) // columns)
     names = {name for ensembles in tasks.values() for name in ensembles}
-    panel = 2.8 if columns == 1 and layout is WIDE else 2.0
-    height = 0.6 + panel * rows + LINE * (2 + len(names) * (0.25 if layout is WIDE else 1.0))
-    figure = Figure(figsize=(layout.width, height), layout="constrained")
-    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    panels = []
-    for axes, (task, head, ensembles) in zip(grid.flat, cells, strict=False):
+    row = 2.8 if layout is WIDE and len(cells) == 1 else 2.0
+    head = 0.6 + LINE * (2 + len(names) * (0.25 if layout is WIDE else 1.0))
+    figure, panels = panel_grid(len(cells), row, replace(layout, columns=min(COLUMNS, layout.columns)), head)
+    for axes, (task, heading, ensembles) in zip(panels, cells, strict=True):
         draw(axes, ensembles, styles)
-        axes.set(title=", ".join(filter(None, (task, head))), xlabel="time [s]")
-        panels.append((axes, task))
-    for axes in grid[:, 1:].flat:
-        axes.set_ylabel("")
-    for axes in grid.flat[len(cells) :]:
-        axes.set_visible(False)
-    add_legend(figure, [axes for axes, _ in panels])
-    return figure, panels
+        axes.set(title=", ".join(filter(None, (task, heading))), xlabel="time [s]")
+    label_rows(panels)
+    add_legend(figure, panels)
+    return figure, [(axes, task) for axes, (task, _, _) in zip(panels, cells, strict=True)]
 
 
 def _features(tasks: Mapping[str, Tracks]) -> list[str]:
@@ -206,10 +184,7 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
     """Draw the true error over time: its median and band over seeds, logarithmic, and where runs settled."""
     first = next(iter(ensembles.values()))
     draw_over_seeds(axes, ensembles, styles, lambda ensemble: ensemble.shown_error)
-    low, high = error_limits(ensembles.values())
-    if high > 0.0:
-        plain_logarithms(axes)
-        axes.set_ylim(low if low > 0.0 else None, high)
+    show_errors(axes, ensembles.values())
     mark_settling_band(axes, first)
     if first.point_to_point:
         _mark_settling_times(axes, ensembles, styles)
@@ -218,14 +193,16 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
     axes.set_ylabel(f"true error [{first.error_unit[0]}]")
 
 
-def error_limits(ensembles: Collection[Ensemble]) -> tuple[float, float]:
-    """Return between which errors these runs are shown [error unit]; 0 where that is not known.
+def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
+    """Set a logarithmic axis and its range to show these errors, if one is above zero.
 
     Errors of a small part of the settling band are left out: they are noise, which a median describes better.
     """
-    largest = [float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0)) for ensemble in ensembles]
-    band = next(iter(ensembles)).settling_band
-    return FLOOR * band if math.isfinite(band) else 0.0, min(1.6 * max(largest), MAX_ERROR)
+    largest = max(float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0)) for ensemble in ensembles)
+    if largest > 0.0:
+        low = FLOOR * next(iter(ensembles)).settling_band
+        plain_logarithms(axes)
+        axes.set_ylim(low if low > 0.0 else None, min(1.6 * largest, MAX_ERROR))
 
 
 def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
@@ -265,8 +242,7 @@ def draw_over_seeds(
         shown = np.where(known, middle, np.nan)
         axes.plot(ensemble.time, shown, label=name, **style.line_arguments(len(shown)))
         if ensemble.mostly_ended:
-            last = np.flatnonzero(known)[-1]
-            axes.plot(ensemble.time[last], middle[last], color=style.colour, **END_MARK)
+            mark_end(axes, ensemble.time, shown, style)
 
 
 def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
@@ -279,12 +255,11 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
             continue
         axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
         if not track.completed:
-            last = np.flatnonzero(np.isfinite(values))[-1]
-            axes.plot(track.time[last], values[last], color=styles[name].colour, **END_MARK)
+            mark_end(axes, track.time, values, styles[name])
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
-def mark_settling_band(axes: Axes, runs: Track | Ensemble) -> None:
+def mark_settling_band(axes: Axes, runs: Shown) -> None:
     """Draw the error within which a run counts as settled, where the table of runs has it."""
     if math.isfinite(runs.settling_band):
         label = f"settling band, {runs.settling_band:g} {runs.error_unit[0]}"
@@ -320,11 +295,13 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
     for line, (name, track) in zip(panels, shown.items(), strict=True):
         for number, column in enumerate(columns):
             _draw_joint(line, track, column, number)
-        for axes, words in zip(line, _words(track), strict=True):
+        for axes, (_, metric, form) in zip(line, QUANTITIES, strict=True):
+            known = track.row.get(metric)
+            words = "" if known is None or np.isnan(known) else form.format(known)
             axes.text(0.985, 0.93, words, transform=axes.transAxes, ha="right", va="top", fontsize=TEXT - 1.5,
                       bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0})  # fmt: skip
         line[0].set_ylabel(name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5)
-    for axes, title in zip(panels[0], QUANTITIES, strict=True):
+    for axes, (title, _, _) in zip(panels[0], QUANTITIES, strict=True):
         axes.set_title(title)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
@@ -336,22 +313,14 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
 
 
 def _draw_joint(line: np.ndarray, track: Track, column: str, number: int) -> None:
+    """Draw a command and its first and second derivative into the panels of a line."""
     colour, dashes = JOINTS[number % len(JOINTS)]
-    look = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
     values: FloatArray = track.column(column)
     period = float(track.time[1] - track.time[0]) if len(values) > 1 else 1.0
-    label = column.removeprefix(COMMAND).rpartition("_rad_s")[0]
     for order, axes in enumerate(line):
-        draw: Callable[..., object] = axes.step if order == 0 else axes.plot
-        extra = {"where": "post"} if order == 0 else {}
         if len(values) > order:
-            draw(track.time[order:], np.diff(values, n=order) / period**order, label=label, **look, **extra)
-
-
-def _words(track: Track) -> list[str]:
-    """Return the text in each panel of a run."""
-    numbers = [
-        track.row.get(name) for name in ("command_switches", "joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3")
-    ]
-    forms = ("{:.0f} sign switches", "RMS {:.3g}", "RMS {:.3g}")
-    return ["" if n is None or np.isnan(n) else form.format(n) for n, form in zip(numbers, forms, strict=True)]
+            axes.plot(
+                track.time[order:], np.diff(values, n=order) / period**order, color=colour, linestyle=dashes,
+                linewidth=0.9, label=column.removeprefix(COMMAND).rpartition("_rad_s")[0],
+                drawstyle="default" if order else "steps-post",
+            )  # fmt: skip

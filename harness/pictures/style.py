@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import math
 import re
@@ -9,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -42,8 +43,15 @@ FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
 LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of its sample line
 MARGIN: Final = 0.2  # [in] on both sides of the legend
 DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
-END_MARK: dict[str, Any] = {"marker": END, "markersize": 12, "markeredgewidth": 2.0, "linestyle": "", "zorder": 12,
-                            "gid": ENDED}  # fmt: skip
+JOINTS: Final = (
+    (BLUE, "-"),
+    (VERMILION, (0, (4, 1))),
+    (GREEN, "-."),
+    (ORANGE, (0, (6, 1, 1, 1))),
+    (PURPLE, (0, (2, 1))),
+    (SKY, "-"),
+    (BLACK, ":"),
+)  # colours and lines of joints in their order
 DASHED = (0, (3.5, 1.5))  # of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 _OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
@@ -105,17 +113,16 @@ class MethodStyle:
     def line_arguments(self, points: int) -> dict[str, Any]:
         """Return keyword arguments for a matplotlib line of `points` points, with about eight markers on it."""
         step = max(1, points // MARKS)
-        return self._arguments() | {"markevery": (int(self.shift * step), step)}
+        return {
+            "color": self.colour, "linestyle": self.line, "linewidth": 1.2, "marker": self.marker, "markersize": 4.0,
+            "markerfacecolor": self.face, "markevery": (int(self.shift * step), step),
+        }  # fmt: skip
 
     def path_arguments(self, points: FloatArray) -> dict[str, Any]:
         """Return keyword arguments for a line through `points`, (k, d), with about eight markers evenly along it."""
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         places = (np.arange(MARKS) + self.shift) / MARKS * way[-1]
-        return self._arguments() | {"markevery": np.unique(np.searchsorted(way, places)).tolist()}
-
-    def _arguments(self) -> dict[str, Any]:
-        look = {"color": self.colour, "linestyle": self.line, "marker": self.marker}
-        return look | {"markersize": 4.0, "linewidth": 1.2, "markerfacecolor": self.face}
+        return self.line_arguments(1) | {"markevery": np.unique(np.searchsorted(way, places)).tolist()}
 
 
 Styles = dict[str, MethodStyle]
@@ -215,11 +222,26 @@ def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1
     return figure, panels[:count]
 
 
-def label_rows(panels: list[Axes], text: str) -> None:
-    """Label the ordinate of the first panel of each row."""
+def label_rows(panels: Iterable[Axes], text: str | None = None) -> None:
+    """Label the ordinate of the first panel of each row only, with `text` or as it is labelled."""
     for axes in panels:
         place = axes.get_subplotspec()
-        axes.set_ylabel(text if place is None or place.is_first_col() else "")
+        first = place is None or place.is_first_col()
+        axes.set_ylabel((axes.get_ylabel() if text is None else text) if first else "")
+
+
+def finish_columns(figure: Figure, panels: np.ndarray) -> None:
+    """Label the ordinates of a grid of panels at its left edge, and add the legend."""
+    label_rows(panels.flat)
+    figure.align_ylabels(panels[:, 0])
+    add_legend(figure, panels.flat)
+
+
+def mark_end(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle) -> None:
+    """Mark the last known point (x, y) of a run that ended early."""
+    last = np.flatnonzero(np.isfinite(y))[-1]
+    axes.plot(x[last], y[last], color=style.colour, marker=END, markersize=12, markeredgewidth=2.0, linestyle="",
+              zorder=12, gid=ENDED)  # fmt: skip
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -244,16 +266,17 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
         )  # fmt: skip
 
 
-def plain_logarithms(axes: Axes) -> None:
-    """Make the value axis logarithmic with plain numbers; where it spans few decades, 2 and 5 have numbers as well."""
+def plain_logarithms(axes: Axes, which: Literal["x", "y"] = "y") -> None:
+    """Make an axis logarithmic with plain numbers; where it spans few decades, 2 and 5 have numbers as well."""
+    axis = axes.yaxis if which == "y" else axes.xaxis
 
     def between(value: float, _position: int | None) -> str:
-        low, high = axes.get_ylim()
+        low, high = sorted(axis.get_view_interval())
         return f"{value:g}" if high < FEW_DECADES * low and f"{value:e}"[0] in "25" else ""
 
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
+    axes.set(**{f"{which}scale": "log"})
+    axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
 
 
 def save_figure(figure: Figure, stem: Path) -> list[Path]:
@@ -288,6 +311,20 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
         indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         indexed.save(small, "PNG", optimize=True)
     return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
+
+
+class Drawing(NamedTuple):
+    """A figure in a page, with the size [px] at which its type is as large as that of the page."""
+
+    data: str  # the PNG file, base64
+    width: int
+    height: int
+
+
+def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
+    """Return a figure for a page; see `picture_of`."""
+    content, width, height = picture_of(figure, layout)
+    return Drawing(base64.b64encode(content).decode("ascii"), width, height)
 
 
 def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[str]]:

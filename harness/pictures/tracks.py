@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, with_places
+from servobench.harness.analysis.comparison import (
+    POINT_TO_POINT,
+    handy_unit,
+    settling_times,
+    texts_of,
+    with_places,
+)
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -26,11 +32,8 @@ FEATURE = "feature_"
 LONG = 6000  # [rows] of a run that is not drawn row by row
 OVERVIEW = 600  # [rows] about, that stand for a long run
 CLOSING = 400  # [rows] at the end of a long run that are drawn one by one: two laps at the default period
-ROOT_MEAN_SQUARES = (
-    "error_norm",
-    "jacobian_error",
-)  # of which a row of an overview has that of all rows for which it stands
 ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"
+ROOT_MEAN_SQUARES = (ERROR, JACOBIAN)  # of which a row of an overview has that of all rows for which it stands
 COLUMNS = ("run_id", "time_s", ERROR, JACOBIAN, STEP_TIME)
 BAND = (0.1, 0.5, 0.9)  # quantiles over seeds: the band's edges and its middle
 WINDOW = 0.5  # [s] over which the error along a curve is averaged
@@ -39,15 +42,40 @@ MIN_SHARE = 0.2  # of a run that a figure shows at least
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """The steps of one run.
+class Shown:
+    """What is shown of runs of a task, as their row in the table of runs says.
 
     Attributes:
-        row: its row in the table of runs.
-        table: its steps, at least one; columns without any value are left out.
+        row: of the run, or of the first one.
     """
 
     row: Mapping[str, Any]
+
+    @property
+    def point_to_point(self) -> bool:
+        """Whether the task has a fixed target."""
+        return bool(self.row.get("task_kind") == POINT_TO_POINT)
+
+    @property
+    def error_unit(self) -> tuple[str, float]:
+        """The unit in which errors are shown, and the factor to it from that of the feature."""
+        return handy_unit(self.row.get("feature_unit"))
+
+    @property
+    def settling_band(self) -> float:
+        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
+        return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Track(Shown):
+    """The steps of one run.
+
+    Attributes:
+        table: its steps, at least one; columns without any value are left out.
+    """
+
     table: pd.DataFrame
 
     @property
@@ -67,30 +95,18 @@ class Track:
         return [name for name in names if f"reference_{name}" in self.table.columns]
 
     @property
-    def point_to_point(self) -> bool:
-        """Whether the reference rests."""
-        return bool(np.ptp(self.vectors("reference_"), axis=0).max(initial=0.0) == 0.0)
-
-    @property
-    def error_unit(self) -> tuple[str, float]:
-        """The unit in which errors are shown, and the factor to it from that of the feature."""
-        return handy_unit(self.row.get("feature_unit"))
-
-    @property
-    def settling_band(self) -> float:
-        """The error within which the run counts as settled [`error_unit`]; NaN if the table has none."""
-        return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
-
-    @property
     def long(self) -> bool:
         """Whether the run has too many rows to draw them one by one."""
         return len(self.table) > LONG
 
     def overview(self) -> Track:
         """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
-        if not self.long:
+        return self.thinned(len(self.table) // OVERVIEW) if self.long else self
+
+    def thinned(self, step: int) -> Track:
+        """Return the track with every `step`-th row, which has the root mean square of errors over these rows."""
+        if step == 1:
             return self
-        step = len(self.table) // OVERVIEW
         few = self.table.iloc[::step].reset_index(drop=True)
         for name in ROOT_MEAN_SQUARES:
             if name in few:
@@ -108,7 +124,7 @@ class Track:
 
     def error(self) -> FloatArray:
         """Return the norm of the true error, (k,) [`error_unit`]."""
-        return self.error_unit[1] * self.column("error_norm")
+        return self.error_unit[1] * self.column(ERROR)
 
     def column(self, name: str) -> FloatArray:
         """Return a column as (k,) numbers; NaN where the run has none."""
@@ -161,17 +177,39 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     """
     for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
-        try:
-            steps = results.load_steps(folder, chosen["run_id"].tolist())
-        except ConfigurationError:  # a sweep keeps no steps, and a run may end before its first
-            continue
-        tables = dict(iter(steps.groupby("run_id", sort=False)))
         tasks: dict[str, Tracks] = {}
-        for row in chosen.to_dict("records"):
-            if row["run_id"] in tables:
-                table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
-                tasks.setdefault(row["task"], {})[row["controller"]] = Track({str(k): row[k] for k in row}, table)
-        yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
+        for track in _load_tracks(folder, chosen):
+            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = track_of(track.row, track.table)
+        if tasks:  # a sweep keeps no steps, and a run may end before its first
+            yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
+
+
+def track_of(row: Mapping[str, Any], steps: pd.DataFrame) -> Track:
+    """Return the track of a run whose steps come from a table with columns of other runs."""
+    return Track(row, steps.dropna(axis=1, how="all").reset_index(drop=True))
+
+
+def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
+    """Return the steps of each run that has some, by its identifier.
+
+    Args:
+        folder: a results folder.
+        run_ids: those wanted.
+        columns: these only; None for all.
+    """
+    try:
+        steps = results.load_steps(folder, run_ids, columns)
+    except ConfigurationError:  # none is kept, or each of these runs ended before its first period
+        return {}
+    return {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
+
+
+def _load_tracks(folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None) -> Iterator[Track]:
+    """Yield the tracks of those runs that have steps, in their order."""
+    tables = load_tables(folder, runs["run_id"].tolist(), columns)
+    for row in runs.drop_duplicates("run_id").to_dict("records"):
+        if row["run_id"] in tables:
+            yield Track({str(key): value for key, value in row.items()}, tables[row["run_id"]])
 
 
 def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
@@ -190,8 +228,9 @@ def label_of(feature: str) -> str:
     return f"{name} [{unit}]"
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed.
 
     Attributes:
@@ -214,22 +253,6 @@ class Ensemble:
     def period(self) -> float:
         """Control period [s]; NaN of a run of one period."""
         return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
-
-    @property
-    def point_to_point(self) -> bool:
-        """Whether the task has a fixed target."""
-        return bool((self.runs.reindex(columns=["task_kind"])["task_kind"] == POINT_TO_POINT).any())
-
-    @property
-    def error_unit(self) -> tuple[str, float]:
-        """The unit in which errors are shown, and the factor to it from that of the feature."""
-        units = self.runs.reindex(columns=["feature_unit"])["feature_unit"].dropna()
-        return handy_unit(units.iloc[0] if len(units) else None)
-
-    @property
-    def settling_band(self) -> float:
-        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
-        return self.error_unit[1] * float(self.runs.reindex(columns=["settling_band"])["settling_band"].iloc[0])
 
     @property
     def settling_time(self) -> float:
@@ -270,20 +293,12 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
         folder: the results folder.
         runs: rows of its table, of one plant and mismatch.
     """
-    try:
-        steps = results.load_steps(folder, runs["run_id"].tolist(), COLUMNS)
-    except ConfigurationError:  # a sweep keeps no steps
-        return {}
     run = results.read_manifest(folder).get("configuration", {}).get("run", {})
     share = float(run.get("camera_moves_at", math.nan))
-    tables = dict(iter(steps.groupby("run_id", sort=False)))
-    found: dict[str, Ensembles] = {}
-    for (task, controller), group in runs.groupby(["task", "controller"], sort=False):
-        known = group[group["run_id"].isin(list(tables))].drop_duplicates("run_id")
-        if len(known):
-            own = [tables[name] for name in known["run_id"]]
-            found.setdefault(str(task), {})[str(controller)] = _ensemble(known, own, share)
-    return found
+    tracks: dict[str, dict[str, list[Track]]] = {}
+    for track in _load_tracks(folder, runs, COLUMNS):
+        tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
+    return {task: {name: _ensemble(own, share) for name, own in named.items()} for task, named in tracks.items()}
 
 
 def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
@@ -296,43 +311,25 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
     return min(end, max(MARGIN * max(times), MIN_SHARE * end))
 
 
-def _ensemble(runs: pd.DataFrame, tables: Sequence[pd.DataFrame], camera_moves_at: float) -> Ensemble:
-    """Return the ensemble of runs and their steps; a camera moves after that share of a run."""
-    longest = max(tables, key=len)
-    known = _camera_moved(runs) and not math.isnan(camera_moves_at)
-    moved_at = float(longest["time_s"].iloc[int(camera_moves_at * len(longest))]) if known else math.nan
-    block = len(longest) // OVERVIEW if len(longest) > LONG else 1
-    count = -(-len(longest) // block)
-    statuses = (runs["status"] == COMPLETED).tolist()
-    unit = handy_unit(runs.reindex(columns=["feature_unit"])["feature_unit"].iloc[0])[1]
-    ends = [0.0 if completed else math.inf for completed in statuses]
-    error = [_padded(table, ERROR, block, count, end or math.nan) for table, end in zip(tables, ends, strict=True)]
-    jacobian = [_padded(table, JACOBIAN, block, count, math.nan) for table in tables]
-    times = np.concatenate([_column(table, STEP_TIME) for table in tables])
+def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
+    """Return the ensemble of tracks; a camera moves after that share of a run."""
+    runs, longest = pd.DataFrame([track.row for track in tracks]), max(tracks, key=lambda track: len(track.table))
+    moves = any(json.loads(text).get("move_angle", 0.0) != 0.0 for text in texts_of(runs, "mismatch_values").dropna())
+    known = moves and not math.isnan(camera_moves_at)
+    moved_at = float(longest.time[int(camera_moves_at * len(longest.time))]) if known else math.nan
+    few = [track.thinned(len(longest.table) // OVERVIEW if longest.long else 1) for track in tracks]
+    time = max((track.time for track in few), key=len)
+
+    def padded(track: Track, values: FloatArray, filling: float) -> FloatArray:
+        return np.concatenate([values, np.full(len(time) - len(values), filling)])
+
+    times = np.concatenate([track.column(STEP_TIME) for track in tracks])
     return Ensemble(
+        tracks[0].row,
         runs,
-        longest["time_s"].to_numpy(dtype=np.float64)[::block],
-        unit * np.stack(error),
-        100.0 * np.stack(jacobian),
+        time,
+        np.stack([padded(track, track.error(), math.nan if track.completed else math.inf) for track in few]),
+        np.stack([padded(track, 100.0 * track.column(JACOBIAN), math.nan) for track in few]),
         times[times > 0.0],
         moved_at,
     )
-
-
-def _camera_moved(runs: pd.DataFrame) -> bool:
-    """Return whether a camera was moved in the middle of these runs, by the values that were drawn for them."""
-    drawn = runs.reindex(columns=["mismatch_values"])["mismatch_values"].dropna()
-    return any(json.loads(text).get("move_angle", 0.0) != 0.0 for text in drawn)
-
-
-def _padded(table: pd.DataFrame, name: str, block: int, count: int, filling: float) -> FloatArray:
-    """Return a column as root mean squares over blocks of rows, (count,), filled up at its end."""
-    values = _column(table, name)
-    if block > 1:
-        means = pd.Series(values**2).groupby(np.arange(len(values)) // block).mean()
-        values = np.sqrt(means.to_numpy())
-    return np.concatenate([values, np.full(count - len(values), filling)])
-
-
-def _column(table: pd.DataFrame, name: str) -> FloatArray:
-    return np.asarray(table.get(name, pd.Series(np.nan, table.index)), dtype=np.float64)

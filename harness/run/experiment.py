@@ -163,11 +163,9 @@ class Experiment:
         return np.stack(arrays) if self.together else arrays[0]
 
 
-def build_experiment(
-    request: RunRequest, settings: Settings, *, keep: Path | None = None, progress: Progress | None = None
-) -> Experiment:
+def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
     """Make a run ready from a request and overrides of the defaults; see `build`."""
-    return build(resolve(request, settings), keep=keep, progress=progress)
+    return build(resolve(request, settings))
 
 
 def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress | None = None) -> Experiment:

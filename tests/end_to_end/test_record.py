@@ -164,7 +164,7 @@ def test_a_stretch_of_a_run_keeps_its_times_and_rows(run):
 
 def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
-    encoder.find_ffmpeg("")  # which starts one the first time
+    encoder.find_ffmpeg()  # which starts one the first time
     started = []
     popen = subprocess.Popen
     monkeypatch.setattr(encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
@@ -181,7 +181,7 @@ def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch
 
 
 def write_frames(path):
-    with encoder.encoding(encoder.find_ffmpeg(""), path, (64, 48), 10.0) as write:
+    with encoder.encoding(encoder.find_ffmpeg(), path, (64, 48), 10.0) as write:
         for _ in range(100):
             write(np.zeros((48, 64, 3), np.uint8))
 

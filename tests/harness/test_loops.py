@@ -11,17 +11,25 @@ from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.laws.mfac import mfac_step
 from servobench.controllers.servo import ServoController
 from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linear_controller, warm_up
-from servobench.harness.analysis.loops.loop_analysis import analyse_loop, delay_margin, linear_response
-from servobench.harness.analysis.loops.response import (
-    LoopResponse,
+from servobench.harness.analysis.loops.loop_analysis import (
     SmallMotions,
+    analyse_loop,
     controller_response,
+    delay_margin,
     excite,
+    linear_response,
+)
+from servobench.harness.analysis.loops.systems import (
+    ArmModel,
+    LoopResponse,
+    StateSpace,
+    closed_loop,
+    decay,
     frequencies,
     gain_crossings,
+    is_stable,
     phase_crossings,
 )
-from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, closed_loop, decay, is_stable
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve

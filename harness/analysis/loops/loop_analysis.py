@@ -1,45 +1,225 @@
-"""The loop of one controller analysed: linearised where it is composed, identified from logged data where it is not."""
+"""The loop of one controller analysed: linearised where it is composed, identified from logged data where it is not.
+
+**Identification.** The controller runs in closed loop with the linear arm around a rest. One after the other, a
+multisine d_i is added to each signal that it measures, the features and the joint positions. Of each experiment the
+last period is logged, of which the discrete Fourier transforms are exact, as everything in it is periodic:
+
+    U(ω) = C(ω) V(ω)   ⇒   C(ω) = U(ω) V(ω)⁻¹
+
+with U (n, m + n) the commands and V (m + n, m + n) the measured signals, a column an experiment. Schoukens and
+Pintelon, *System Identification: A Frequency Domain Approach*, chapters 2 and 5. The reference is constant, so that a
+feedforward of it does not pass for feedback. Adaptation in the small motions is part of the response.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final, NamedTuple, final
 
 import numpy as np
 import pandas as pd
 
+from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
-from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Source, Warm, linear_controller, warm_up
-from servobench.harness.analysis.loops.response import (
+from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, linear_controller, warm_up
+from servobench.harness.analysis.loops.systems import (
     POINTS,
+    ArmModel,
+    ComplexArray,
     LoopResponse,
     Margins,
-    SmallMotions,
-    controller_response,
-    excite,
+    StateSpace,
+    closed_loop,
     frequencies,
-    simulated_step,
-    step_responses,
+    is_stable,
+    largest_gain,
+    sensitivity,
 )
-from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, closed_loop, is_stable
+from servobench.harness.analysis.statistics import number
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.run.loop import one_thread
+from servobench.harness.run.loop import LoopSettings, Rollout, one_thread, periods
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import fitted
+from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.faults import ControllerDiverged, RunFault
+from servobench.plant.contract.signals import Command, Observation, Truth
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
 
+LENGTH = 256  # [periods] of the multisine
+AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine
+SETTLING = 100  # [periods] of rest before the experiments
+MAX_MOTION = 0.1  # [m] beyond it a loop is not at small motions any more
 STEP_DURATION = 4.0  # [s] of the step responses
 FAST_POINTS = 150  # of the frequency axis where only the delay margin is wanted
+SHOWN: Final = {
+    "gain\nmargin": ("gain_margin", 1.0, 2),
+    "phase\nmargin, °": ("phase_margin_deg", 1.0, 0),
+    "delay\nmargin, ms": ("delay_margin_s", 1000.0, 0),
+    "peak\nM_s": ("sensitivity_peak", 1.0, 2),
+    "disk\nmargin": ("disk_margin", 1.0, 2),
+    "over-\nshoot, %": ("overshoot", 100.0, 0),
+}  # heading in a terminal -> column, factor, digits
+SIMULATED: Final = {
+    "gain\nmargin": ("gain_margin", 1.0, 2),
+    "gain,\nsimulated": ("simulated_gain_margin", 1.0, 2),
+    "latency\nlimit, ms": ("latency_limit_s", 1000.0, 0),
+    "latency,\nsimulated": ("simulated_latency_limit_s", 1000.0, 0),
+}  # the same where limits were simulated, too
 LEGEND = (
     "Gain margin: factor on the command. Delay margin: further latency of the camera. M_s: largest singular value of "
     "the sensitivity at the feature. Disk margin: for changes of each feature by itself. A dash: the loop is unstable. "
     "Linearised loops have frozen estimators; how these adapt is not judged."
 )
+
+
+class Record(NamedTuple):
+    """The logged signals of one experiment.
+
+    Attributes:
+        measured: features and joint positions as the controller saw them, as deviations, (periods, m + n).
+        command: (periods, n) [rad/s].
+    """
+
+    measured: FloatArray
+    command: FloatArray
+
+
+@final
+class LinearArm(Plant):
+    """The linear arm around a rest, as a plant whose measurements can be excited.
+
+    Attributes:
+        measured: deviations of features and joint positions since `excite`, one (m + n,) a period.
+    """
+
+    def __init__(self, arm: ArmModel, rest: Rest) -> None:
+        """Begin at the rest."""
+        self._system, self._period, self._rest = arm.matrices(), arm.period, rest
+        self._m = len(arm.jacobian)
+        self._x, self._k = np.zeros(len(self._system.A)), 0
+
+    def excite(self, added: FloatArray) -> Observation:
+        """Add signals to the measurements from now on, (periods, m + n) m and rad, and return the present observation.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        self._added, self.measured = added, list[FloatArray]()
+        return self._observe()
+
+    def reset(self, seed: int) -> Observation:
+        """Measure without excitation; nothing is random. See `Plant.reset`."""
+        return self.excite(np.zeros((0, len(self._system.C))))
+
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        self._x = self._system.A @ self._x + self._system.B @ command.joint_velocity
+        self._k += 1
+        return self._observe()
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        return Truth(self._rest.feature + (self._system.C @ self._x)[: self._m], None)
+
+    def close(self) -> None:
+        """See `Plant.close`; nothing is held."""
+
+    def _observe(self) -> Observation:
+        deviation, row, rest, m = self._system.C @ self._x, len(self.measured), self._rest, self._m
+        if row < len(self._added):
+            deviation = deviation + self._added[row]
+            if not np.abs(deviation[:m]).max() < MAX_MOTION:
+                raise ControllerDiverged(f"the loop is unstable: {MAX_MOTION} m were exceeded in small motions")
+            self.measured.append(deviation)
+        time = rest.time + self._k * self._period
+        return Observation(time, rest.joint_position + deviation[m:], rest.feature + deviation[:m])
+
+
+class SmallMotions:
+    """A controller in closed loop with the linear arm around a rest."""
+
+    def __init__(self, controller: Controller, arm: ArmModel, rest: Rest) -> None:
+        """Let the controller settle; it is left in the state that it has then.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        self._controller, self._rest, self._arm = controller, rest, LinearArm(arm, rest)
+        self.run(np.zeros((SETTLING, sum(arm.jacobian.shape))))
+
+    def run(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
+        """Go on with signals added to the measurements, (periods, m + n).
+
+        Args:
+            added: m and rad.
+            desired: (m,) [m], a deviation of the reference; None for none.
+
+        Raises:
+            ControllerDiverged: the loop is not stable.
+        """
+        wanted = self._rest.feature if desired is None else self._rest.feature + desired
+        rows = np.tile(wanted, (len(added) + self._rest.preview + 1, 1))
+        rollout = Rollout(self._arm, self._arm.excite(added), rows, LoopSettings(len(added), self._rest.preview))
+        command = [period.command.joint_velocity for period in periods(rollout, self._controller)]
+        return Record(np.array(self._arm.measured), np.array(command))
+
+    def tried(self, added: FloatArray, desired: FloatArray | None = None) -> Record:
+        """Return the record of `run`, and restore the state from before it."""
+        controller, arm = self._controller.save(), self._arm.save()
+        record = self.run(added, desired)
+        self._controller.restore(controller)
+        self._arm.restore(arm)
+        return record
+
+
+def multisine(length: int, amplitude: float) -> FloatArray:
+    """Return one period of equal sines at all harmonics with Schroeder's phases, (length,), without a mean."""
+    harmonics = np.arange(1, length // 2 + 1)
+    spectrum = np.zeros(length // 2 + 1, dtype=np.complex128)
+    spectrum[1:] = np.exp(-1j * np.pi * harmonics * (harmonics - 1) / len(harmonics))
+    spectrum[-1] = 1.0  # real at the Nyquist frequency
+    signal = np.fft.irfft(spectrum, length)
+    return np.asarray(amplitude * signal / np.sqrt(np.mean(signal**2)))
+
+
+def excite(loop: SmallMotions, inputs: int, length: int = LENGTH, amplitude: float = AMPLITUDE) -> list[Record]:
+    """Return an experiment for each of the signals that the controller measures: its second period, less the rest."""
+    signal = np.tile(multisine(length, amplitude), 2)
+    rest = loop.tried(np.zeros((len(signal), inputs)))
+    excited = [loop.tried(np.outer(signal, each)) for each in np.eye(inputs)]
+    return [Record(each.measured[length:] - rest.measured[length:], each.command[length:] - rest.command[length:])
+            for each in excited]  # fmt: skip
+
+
+def step_responses(loop: SmallMotions, m: int, n: int, periods: int, amplitude: float = AMPLITUDE) -> FloatArray:
+    """Return each feature after a unit step of its own reference, (periods, m), measured in small motions."""
+    nothing = np.zeros((periods, m + n))
+    rest = loop.tried(nothing).measured
+    moved = [loop.tried(nothing, amplitude * each).measured for each in np.eye(m)]
+    return np.stack([(each - rest)[:, i] / amplitude for i, each in enumerate(moved)], axis=-1)
+
+
+def controller_response(records: list[Record], period: float) -> tuple[FloatArray, ComplexArray]:
+    """Return the frequencies (k,) [rad/s] and the controller's response (k, n, m + n) there.
+
+    Args:
+        records: as many experiments as the controller measures signals, each one whole period of its excitation.
+        period: of sampling [s].
+    """
+    V = np.stack([np.fft.rfft(record.measured, axis=0)[1:] for record in records], axis=-1)
+    U = np.stack([np.fft.rfft(record.command, axis=0)[1:] for record in records], axis=-1)
+    length = len(records[0].measured)
+    frequency = 2.0 * np.pi * np.arange(1, length // 2 + 1) / (length * period)
+    response = np.linalg.solve(np.swapaxes(V, -1, -2), np.swapaxes(U, -1, -2))
+    return np.asarray(frequency, np.float64), np.asarray(np.swapaxes(response, -1, -2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +233,6 @@ class LoopAnalysis:
         margins: of the loop.
         response: the frequency response of controller and loop.
         step: each feature after a unit step of its own reference, (periods, m).
-        system: the closed loop from the references to the measured signals; None for an identified one.
     """
 
     name: str
@@ -62,7 +241,6 @@ class LoopAnalysis:
     margins: Margins
     response: LoopResponse
     step: FloatArray
-    system: StateSpace | None
 
     @property
     def arm(self) -> ArmModel:
@@ -89,8 +267,7 @@ class LoopAnalysis:
             arm = replace(self.arm, latency=latency)
             for i in np.flatnonzero(factors < limits[j]):
                 L = LoopResponse(frequency, factors[i] * controller, arm).at_feature()
-                S = np.linalg.inv(np.eye(L.shape[-1]) + L)
-                peaks[i, j] = np.linalg.norm(S, ord=2, axis=(-2, -1)).max()
+                peaks[i, j] = largest_gain(sensitivity(L)).max()
         return peaks
 
 
@@ -108,9 +285,16 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
     """
     with one_thread():
         warm, name = warm_up(resolved), resolved.request.controller
+        arm, (m, n) = warm.arm, warm.arm.jacobian.shape
+        steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
-            return _linearised(name, warm, source)
-        return _identified(name, warm)
+            controller = linear_controller(warm, source)
+            closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
+            stable, step = is_stable(closed.A), closed.step(m, steps)
+            return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
+        loop = SmallMotions(warm.controller, arm, warm.rest)
+        response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)
+        return LoopAnalysis(name, "identified", True, response.margins(), response, step_responses(loop, m, n, steps))
 
 
 def delay_margin(
@@ -118,7 +302,6 @@ def delay_margin(
     name: str,
     run: RunSettings | None = None,
     plant: KinematicConfig | None = None,
-    seed: int = 0,
     robot: str = DEFAULT_ROBOT,
 ) -> float:
     """Return by how much later the camera may be before the loop of a composed controller is unstable, s.
@@ -131,7 +314,6 @@ def delay_margin(
         name: of the controller.
         run: period and preview; default: those of a run.
         plant: lag, delays and noise; default: those of the kinematic plant.
-        seed: of the move.
         robot: name, or the path of a file.
 
     Returns:
@@ -141,7 +323,7 @@ def delay_margin(
         TypeError: a controller that is not composed.
         ConfigurationError: a name or a setting that cannot be used.
     """
-    request = RunRequest(PLANT, name, TASK, Mismatch(), seed, robot=robot)
+    request = RunRequest(PLANT, name, TASK, Mismatch(), 0, robot=robot)
     task = fitted(TASK, find_robot(robot))
     resolved = ResolvedRun(request, run or RunSettings(), plant or KinematicConfig(), config, task)
     with one_thread():
@@ -168,21 +350,17 @@ def latency_border(
     The controller is warmed up at each latency, so that its aids have identified it.
 
     Args:
-        config: settings of the controller.
+        config: settings of the controller; this and the next ones as of `delay_margin`.
         name: of the controller.
         latencies: ascending, from 0 on [s]; beyond the last one nothing is predicted.
-        run: see `delay_margin`.
-        plant: see `delay_margin`; its own latency is replaced.
-        robot: see `delay_margin`.
-
-    Raises:
-        TypeError: a controller that is not composed.
-        ConfigurationError: a name or a setting that cannot be used.
+        run: period and preview.
+        plant: lag, delays and noise; its latency is replaced.
+        robot: name, or the path of a file.
     """
     world, border = plant or KinematicConfig(), 0.0
     for latency in latencies:
         later = replace(world, sensing=replace(world.sensing, latency=latency))
-        margin = delay_margin(config, name, run, later, robot=robot)
+        margin = delay_margin(config, name, run, later, robot)
         if margin == 0.0:
             return min(border, latency)
         border = latency + margin
@@ -193,24 +371,6 @@ def linear_response(controller: StateSpace, arm: ArmModel, points: int = POINTS)
     """Return the frequency response of a linear controller on an arm, at so many points."""
     axis, measured = frequencies(arm.period, points), sum(arm.jacobian.shape)
     return LoopResponse(axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm)
-
-
-def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
-    controller, arm = linear_controller(warm, source), warm.arm
-    closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
-    periods = round(STEP_DURATION / arm.period)
-    step = simulated_step(closed, len(arm.jacobian), arm.period, periods)
-    return LoopAnalysis(name, "linearised", is_stable(closed.A), response.margins(), response, step, closed)
-
-
-def _identified(name: str, warm: Warm) -> LoopAnalysis:
-    arm = warm.arm
-    m, n = arm.jacobian.shape
-    loop = SmallMotions(warm.controller, arm, warm.rest)
-    frequency, controller = controller_response(excite(loop, m + n), arm.period)
-    response = LoopResponse(frequency, controller, arm)
-    step = step_responses(loop, m, n, round(STEP_DURATION / arm.period))
-    return LoopAnalysis(name, "identified", True, response.margins(), response, step, None)
 
 
 def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
@@ -239,19 +399,7 @@ def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
 
 def printed(table: pd.DataFrame) -> pd.DataFrame:
     """Return the table as text for a terminal."""
-    columns = {"controller": table["controller"], "gain\nmargin": _text(table["gain_margin"], 2)}
-    if "simulated_gain_margin" in table:
-        columns["gain,\nsimulated"] = _text(table["simulated_gain_margin"], 2)
-        columns["latency\nlimit, ms"] = _text(1000.0 * table["latency_limit_s"], 0)
-        columns["latency,\nsimulated"] = _text(1000.0 * table["simulated_latency_limit_s"], 0)
-        return pd.DataFrame(columns)
-    columns["phase\nmargin, °"] = _text(table["phase_margin_deg"], 0)
-    columns["delay\nmargin, ms"] = _text(1000.0 * table["delay_margin_s"], 0)
-    columns["peak\nM_s"] = _text(table["sensitivity_peak"], 2)
-    columns["disk\nmargin"] = _text(table["disk_margin"], 2)
-    columns["over-\nshoot, %"] = _text(100.0 * table["overshoot"], 0)
-    return pd.DataFrame(columns)
-
-
-def _text(values: pd.Series[float], digits: int) -> pd.Series[str]:
-    return values.map(lambda value: "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.{digits}f}")
+    shown = SIMULATED if "simulated_gain_margin" in table else SHOWN
+    text = {head: [number(factor * value, f".{digits}f") for value in table[name]]
+            for head, (name, factor, digits) in shown.items()}  # fmt: skip
+    return pd.DataFrame({"controller": table["controller"], **text})

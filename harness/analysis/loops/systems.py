@@ -1,25 +1,45 @@
-"""Discrete linear systems as plain float64 matrices, x₊ = A x + B u, y = C x + D u, and the one of arm and camera.
+"""Discrete linear systems, x₊ = A x + B u, y = C x + D u; arm and camera as one; and the margins of loops.
 
 Around a rest, with command delay, joint lag, integrator, Jacobian and latency, arm and camera are
 
     q̇ = v,   τ v̇ = u(t − D) − v,   y(t) = J q(t − ℓ)        sampled every dt, u held over a period
 
 Neither the command delay D nor the latency ℓ needs to be a multiple of the period dt.
+
+**Margins.** With the loop L(z) broken at one place, its characteristic loci λ_i(ω) are the eigenvalues of
+L(e^{jω dt}). The closed loop is at the border of stability where a locus passes −1, so that for the same change of all
+channels at once exactly
+
+    gain margin      1/|λ|      where arg λ = −π
+    phase margin     arg λ + π  where |λ| = 1
+    delay margin     (arg λ + π mod 2π)/ω   where |λ| = 1
+
+and, for channels that change each by itself, with S = (I + L)⁻¹ and T = L S,
+
+    sensitivity peak M_s = max σ̄(S),     disk margin α = 1 / max σ̄((S − T)/2)
+
+α is the balanced one for unstructured changes: a lower bound of that for diagonal ones, and equal to it in one channel.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import discretise_lag
 
 ComplexArray = npt.NDArray[np.complex128]
 STABILITY_TOLERANCE = 1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences
+MIN_FREQUENCY = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
+POINTS = 400  # of the frequency axis
+NEGLIGIBLE = 1e-6  # [1] a locus that stays below this never matters
 WHOLE = 1e-9  # [1] a share of a period below which a delay is a whole number of periods
 
 
@@ -43,11 +63,13 @@ class StateSpace(NamedTuple):
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
         return np.asarray(self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D)
 
-    def as_control(self, period: float) -> Any:  # noqa: ANN401 - python-control has no types
-        """Return the system as a `control.StateSpace` with the sampling period [s]."""
-        import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
-
-        return control.ss(*self, period)
+    def step(self, outputs: int, periods: int) -> FloatArray:
+        """Return each of the first outputs after a unit step of the input with its number, (periods, outputs)."""
+        x, y = np.zeros((len(self.A), outputs)), np.zeros((periods, outputs))
+        for k in range(periods):
+            y[k] = np.diagonal(self.C[:outputs] @ x + self.D[:outputs, :outputs])
+            x = self.A @ x + self.B[:, :outputs]
+        return y
 
 
 def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) -> StateSpace:
@@ -132,43 +154,28 @@ class ArmModel:
         States: q, v, the commands u(k−1), u(k−2), … under way, and q at the exposure between the last two instants
         where the latency has a part of a period.
         """
-        dt = self.period
-        waiting, part = split(self.command_delay, dt)
-        _, early = split(self.latency, dt)
+        waiting, part = split(self.command_delay, self.period)
+        _, early = split(self.latency, self.period)
         queue = waiting + (part > 0.0)
-        until_now = self._advance(dt, waiting, part)
-        size = 2 + queue + (early > 0.0)
-        A, B, C = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((2, size))
-        A[:2, : 2 + queue], B[:2] = until_now
-        for i in range(queue):
-            A[2 + i, 1 + i], B[2 + i] = float(i > 0), float(i == 0)
+        every = np.eye(3 + queue + (early > 0.0))  # a row for each state, and the last one for u(k)
+        position, motion, commands = every[0], every[:2], np.vstack([every[-1], every[2 : 2 + queue]])
+
+        def after(time: float) -> FloatArray:
+            """Return q and v `time` [s] into the period, of which the command of the period before has its part."""
+            state, before = motion, min(time, part)
+            for span, command in ((before, commands[-1]), (time - before, commands[waiting])):
+                if span > 0.0:
+                    A, b = discretise_lag(self.lag, span)
+                    state = A @ state + np.outer(b, command)
+            return state
+
+        rows = [after(self.period), commands[:queue]]
+        exposed = position
         if early > 0.0:
-            from_state, from_command = self._advance(dt - early, waiting, part)
-            A[-1, : 2 + queue], B[-1] = from_state[0], from_command[0]
-        C[0, -1 if early > 0.0 else 0], C[1, 0] = 1.0, 1.0
-        return StateSpace(A, B, C, np.zeros((2, 1)))
-
-    def _advance(self, time: float, waiting: int, part: float) -> _Advance:
-        """Return how (q, v) `time` [s] into a period follow from q, v, the waiting commands, and u(k)."""
-        queue = waiting + (part > 0.0)
-        before = min(time, part)  # the command of the period before still acts
-        first, by_first = discretise_lag(self.lag, before) if before > 0.0 else (np.eye(2), np.zeros(2))
-        after = time - before
-        then, by_then = discretise_lag(self.lag, after) if after > 0.0 else (np.eye(2), np.zeros(2))
-        state, command = np.zeros((2, 2 + queue)), np.zeros((2, 1))
-        state[:, :2] = then @ first
-        if part > 0.0:
-            state[:, 2 + waiting] += then @ by_first
-        if waiting:
-            state[:, 1 + waiting] += by_then
-        else:
-            command[:, 0] = by_then
-        return _Advance(state, command)
-
-
-class _Advance(NamedTuple):
-    from_state: FloatArray  # (2, 2 + queue)
-    from_command: FloatArray  # (2, 1)
+            rows.append(after(self.period - early)[:1])
+            exposed = every[-2]
+        new = np.vstack(rows)
+        return StateSpace(new[:, :-1], new[:, -1:], np.vstack([exposed, position])[:, :-1], np.zeros((2, 1)))
 
 
 def split(delay: float, period: float) -> tuple[int, float]:
@@ -178,3 +185,155 @@ def split(delay: float, period: float) -> tuple[int, float]:
     if abs(periods - whole) < WHOLE:
         return whole, 0.0
     return int(periods), delay - int(periods) * period
+
+
+@dataclass(frozen=True)
+class Margins:
+    """The margins of a loop.
+
+    Attributes:
+        gain: the factor on the command above 1 at which the loop becomes unstable; inf if there is none.
+        gain_reduction: the factor below 1 at which it becomes unstable; 0 if there is none.
+        phase: [rad], of all features together; inf where no locus crosses the unit circle.
+        delay: additional latency of the camera at which the loop becomes unstable [s]; inf if there is none.
+        crossover: largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none does.
+        sensitivity_peak: M_s, at the feature [1].
+        complementary_peak: max σ̄(T), at the feature [1].
+        disk: α, at the feature [1].
+    """
+
+    gain: float
+    gain_reduction: float
+    phase: float
+    delay: float
+    crossover: float
+    sensitivity_peak: float
+    complementary_peak: float
+    disk: float
+
+
+def frequencies(period: float, points: int = POINTS) -> FloatArray:
+    """Return a logarithmic axis up to the Nyquist frequency, (points,) [rad/s]."""
+    nyquist = np.pi / period
+    return np.geomspace(MIN_FREQUENCY * nyquist, nyquist, points)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResponse:
+    """The frequency response of a controller on an arm, and of the loops that they make.
+
+    Attributes:
+        frequency: ω, (k,) [rad/s], ascending.
+        controller: from the measured feature and joint positions to the command, (k, n, m + n) [rad/s].
+        arm: linear model of arm and camera.
+    """
+
+    frequency: FloatArray
+    controller: ComplexArray
+    arm: ArmModel
+
+    @property
+    def z(self) -> ComplexArray:
+        """e^{jω dt}, (k,)."""
+        return np.asarray(np.exp(1j * self.frequency * self.arm.period))
+
+    def at_command(self) -> ComplexArray:
+        """Return L broken at the command, (k, n, n)."""
+        J, (exposed, joints) = self.arm.jacobian, self.arm.response(self.z)
+        m = len(J)
+        by_feature = exposed[:, None, None] * (self.controller[:, :, :m] @ J)
+        return -by_feature - joints[:, None, None] * self.controller[:, :, m:]
+
+    def at_feature(self) -> ComplexArray:
+        """Return L broken at the measured feature, (k, m, m), with the joint positions fed back."""
+        J, (exposed, joints) = self.arm.jacobian, self.arm.response(self.z)
+        m, n = J.shape
+        inner = np.eye(n) - joints[:, None, None] * self.controller[:, :, m:]
+        command = np.linalg.solve(inner, self.controller[:, :, :m])
+        return np.asarray(-exposed[:, None, None] * (J @ command))
+
+    @cached_property
+    def _gains(self) -> FloatArray:
+        return gain_crossings(self.at_command())
+
+    @cached_property
+    def _phases(self) -> tuple[FloatArray, FloatArray]:
+        return phase_crossings(self.at_feature(), self.frequency)
+
+    def margins(self) -> Margins:
+        """Return the margins: of the gain at the command, of the rest at the measured feature."""
+        gain, (phase, where) = self._gains, self._phases
+        S = sensitivity(self.at_feature())
+        every = np.eye(S.shape[-1])
+        return Margins(
+            gain=float(gain[gain >= 1.0].min(initial=np.inf)),
+            gain_reduction=float(gain[gain < 1.0].max(initial=0.0)),
+            phase=float(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf)),
+            delay=self.delay_margin(),
+            crossover=float(where.max(initial=0.0)),
+            sensitivity_peak=float(largest_gain(S).max()),
+            complementary_peak=float(largest_gain(every - S).max()),
+            disk=1.0 / float(largest_gain(S - every / 2.0).max()),
+        )
+
+    def delay_margin(self) -> float:
+        """Return the additional latency at which the loop becomes unstable [s], inf if there is none."""
+        phase, where = self._phases
+        return float((phase / where).min(initial=np.inf))
+
+    def gain_limit(self) -> float:
+        """Return the least factor on the command at which the loop becomes unstable, inf if there is none.
+
+        For a loop that is stable at small gains, whether or not it is at the present one.
+        """
+        return float(self._gains.min(initial=np.inf))
+
+
+def sensitivity(L: ComplexArray) -> ComplexArray:
+    """Return S = (I + L)⁻¹, (k, c, c), of L, (k, c, c)."""
+    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) + L))
+
+
+def largest_gain(response: ComplexArray) -> FloatArray:
+    """Return the largest singular value at each frequency, (k,)."""
+    return np.asarray(np.linalg.norm(response, ord=2, axis=(-2, -1)), np.float64)
+
+
+def loci(L: ComplexArray) -> ComplexArray:
+    """Return the eigenvalues of L, (k, c, c), ordered so that each column, (k, c), is one smooth curve."""
+    values = np.linalg.eigvals(L)
+    for before, now in pairwise(values):
+        _, order = linear_sum_assignment(np.abs(before[:, None] - now[None, :]))
+        now[:] = now[order]
+    return np.asarray(values)
+
+
+def gain_crossings(L: ComplexArray) -> FloatArray:
+    """Return the factors at which a locus passes −1, (crossings,)."""
+    values = _relevant(loci(L))
+    before, after = values[:-1], values[1:]
+    crosses = (np.sign(before.imag) != np.sign(after.imag)) & (before.imag != after.imag)
+    share = before.imag[crosses] / (before.imag[crosses] - after.imag[crosses])
+    real = before.real[crosses] + share * (after.real[crosses] - before.real[crosses])
+    last = values[-1]  # at the Nyquist frequency the loci are real
+    ends = last.real[np.abs(last.imag) <= NEGLIGIBLE * np.abs(last)]
+    real = np.concatenate([real, ends])
+    return -1.0 / real[real < 0.0]
+
+
+def phase_crossings(L: ComplexArray, frequency: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return where loci cross the unit circle: arg λ + π in [0, 2π) [rad] and ω [rad/s], (crossings,) each."""
+    values = _relevant(loci(L))
+    level = np.log(np.abs(values))
+    crosses = np.sign(level[:-1]) != np.sign(level[1:])
+    share = level[:-1][crosses] / (level[:-1][crosses] - level[1:][crosses])
+    row, _ = np.nonzero(crosses)
+    before, turn = np.angle(values[:-1][crosses]), np.angle(values[1:][crosses] / values[:-1][crosses])
+    phase = np.mod(before + share * turn + np.pi, 2.0 * np.pi)
+    where = frequency[row] * (frequency[row + 1] / frequency[row]) ** share
+    return phase, where
+
+
+def _relevant(values: ComplexArray) -> ComplexArray:
+    """Return the loci that are not zero by construction, as those of the null space are."""
+    return values[:, np.abs(values).max(axis=0) > NEGLIGIBLE]
