@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-WHOLE_FOLDERS = ("closed_loop", "end_to_end")  # whose tests are all slow
+SLOW = {  # folders and files whose tests are all slow
+    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_exit_codes", "test_fmu_model", "test_groups",
+    "test_integrity", "test_outcome",
+}  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
 settings.register_profile("servobench", deadline=None, derandomize=True)
@@ -35,7 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the slow tests first, so that the quick ones fill the end of a run in several processes."""
     for item in items:
-        if item.path.parent.name in WHOLE_FOLDERS:
+        if SLOW & {item.path.parent.name, item.path.stem}:
             item.add_marker("slow")
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 

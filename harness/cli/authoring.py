@@ -29,7 +29,7 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
-    folder: Annotated[Path, option("--folder", "FOLDER", "Folder for the files.")] = Path(),
+    folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
 ) -> None:
     """Write a commented controller or plant, and its test."""
     if kind not in NEXT:
@@ -58,7 +58,7 @@ def check(
     subject: Annotated[
         list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
     ],
-    limit: Annotated[float, option("--limit", "SECONDS", "Time limit of one check [s].", min=1.0)] = 60.0,
+    limit: Annotated[float, option("SECONDS", "Time limit of one check [s].", min=1.0)] = 60.0,
 ) -> None:
     """Check a controller or a plant against its contract.
 
@@ -101,14 +101,12 @@ def shadow(
         Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
     ],
     controller: Annotated[
-        str | None, option("--controller", CONTROLLER, "Name or file of the controller; default: that of the run.")
+        str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[
-        Path | None, option("--out", "FILE", "CSV file for the commands of the controller at each instant.")
-    ] = None,
+    out: Annotated[Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
 

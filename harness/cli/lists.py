@@ -60,9 +60,7 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)] = None,
-    robot: Annotated[
-        str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
-    ] = DEFAULT_ROBOT,
+    robot: Annotated[str, options.option(options.ROBOT._replace(check=None), options.ROBOT_WORDS)] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import option
+from servobench.harness.cli.options import named_option, option
 from servobench.harness.cli.terminal import console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
@@ -26,22 +26,23 @@ def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
     *,
     mismatch: options.MismatchOption = "none",
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
+    seed: Annotated[int, option("INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
         Literal["true", "nominal", "estimated"],
-        option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
+        option("NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
     ] = "true",
     identify: Annotated[
         bool,
-        option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
+        named_option(
+            "--identify", "", "Identify all loops from logged small motions, while estimators go on learning."
+        ),
     ] = False,
     simulate: Annotated[
-        bool, option("--simulate", "", "Also find the limits of gain and latency by simulation.")
+        bool, named_option("--simulate", "", "Also find the limits of gain and latency by simulation.")
     ] = False,
     overrides: options.Overrides,
-    out: Annotated[Path, option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
-    / "analyse",
+    out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results") / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option
 from servobench.harness.cli.results import judge, make_report, print_faults
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
@@ -23,49 +23,39 @@ if TYPE_CHECKING:
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
 OutOption = Annotated[
-    Path | None, option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
+    Path | None, named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
 ]
-ReportOption = Annotated[bool, option("--report/--no-report", "", "Also make the page report.html.")]
+ReportOption = Annotated[bool, named_option("--report/--no-report", "", "Also make the page report.html.")]
 
 
 def run(
     method: Annotated[
         str | None,
         typer.Argument(
-            metavar="CONTROLLER",
-            help="Short for --controller.",
-            show_default=False,
-            autocompletion=CONTROLLER.complete,
+            metavar="CONTROLLER", help="Short for --controller.", show_default=False, autocompletion=CONTROLLER.complete
         ),
     ] = None,
     *,
     plant: Annotated[
         str | None,
         option(
-            "--plant",
-            PLANT,
-            "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
+            PLANT, "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed."
         ),
     ] = None,
     controller: Annotated[
         str | None,
         option(
-            "--controller",
-            CONTROLLER,
-            f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
+            CONTROLLER, f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}."
         ),
     ] = None,
-    estimator: Annotated[
-        str | None,
-        option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
-    ] = None,
+    estimator: Annotated[str | None, option(ESTIMATOR, "Compose the law --controller with this estimator.")] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of everything random in the run.")] = 0,
+    seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,
     overrides: options.Overrides,
-    view: Annotated[bool, option("--view", "", "Watch the bullet plant in a window.")] = False,
+    view: Annotated[bool, named_option("--view", "", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
     limited: options.Limited,
@@ -125,10 +115,7 @@ def compare(
 
 def train(
     *,
-    controller: Annotated[
-        str,
-        option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
-    ] = "rbfnn_mfac",
+    controller: Annotated[str, option(CONTROLLER, "Name of the controller whose networks to train.")] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     overrides: options.Overrides,

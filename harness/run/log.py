@@ -111,23 +111,17 @@ class StepLog:
             periods: how many rows there is room for.
             lanes: the leading axes of runs side by side.
         """
-        features, joints, jacobians = ((periods, *lanes, *own) for own in ((spec.m,), (spec.n,), (spec.m, spec.n)))
+        features, joints, jacobian = (*lanes, spec.m), (*lanes, spec.n), (*lanes, spec.m, spec.n)
+        shapes = {
+            **dict.fromkeys(("time", "controller_time", "plant_time"), ()),
+            **dict.fromkeys(("reference", "feature", "true_feature"), features),
+            **dict.fromkeys(("joint_position", "command"), joints),
+            **dict.fromkeys(("estimated_jacobian", "true_jacobian"), jacobian),
+        }
         self._count = 0
-        self._rows = Steps(
-            spec=spec,
-            time=np.empty(periods),
-            reference=np.empty(features),
-            feature=np.empty(features),
-            true_feature=np.empty(features),
-            joint_position=np.empty(joints),
-            command=np.empty(joints),
-            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
-            estimated_jacobian=np.full(jacobians, np.nan),
-            true_jacobian=np.full(jacobians, np.nan),
-            controller_time=np.empty(periods),
-            plant_time=np.empty(periods),
-            diagnostics={},
-        )
+        numbers = {name: np.full((periods, *shape), np.nan) for name, shape in shapes.items()}
+        valid = np.empty((periods, *lanes), dtype=np.bool_)
+        self._rows = Steps(spec, feature_valid=valid, diagnostics={}, **numbers)
 
     def add(
         self,

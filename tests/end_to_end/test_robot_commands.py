@@ -52,7 +52,7 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(mo
     path = tmp_path / "ur5.fmu"
     arguments = "--fmi", "3", "--mismatch", "severe", "--seed", "3", "-o", str(path)
     assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
-    start = {variable.name: variable.start for variable in read_information(path).variables}
+    start = {variable.name: variable.start for variable in read_information(path).description.modelVariables}
     run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
     exported = np.array(start["joint_offset"].split(), dtype=float)
     np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)

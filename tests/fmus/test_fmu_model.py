@@ -69,7 +69,6 @@ class Opened:
         self.instance.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("version", "mismatch"), [(2, "severe"), (3, "factory")])
 def test_the_fmu_agrees_with_the_kinematic_plant_over_five_hundred_random_steps(version, mismatch):
     common = {"feature_noise": 0.002, "latency": 0.05, "drop_probability": 0.1, "joint_range": 2.9}
@@ -212,7 +211,6 @@ plant.close()
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(version):
     config = configure(Ur5FmuConfig, fmi_version=version, latency=0.1, drop_probability=0.1)

@@ -77,7 +77,6 @@ def test_settings_of_a_plant_reach_it(tmp_path):
     assert speeds[1.0] == pytest.approx(1.0)
 
 
-@pytest.mark.slow
 def test_worker_processes_carry_out_the_same_runs_as_this_one(tmp_path):
     write(tmp_path, CELL, "a/cell.py")
     write(tmp_path, WHOLE, "b/mine.py")
@@ -205,7 +204,6 @@ def test_an_empty_name_is_no_plant(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("servobench: unknown plant ''")
 
 
-@pytest.mark.slow
 def test_a_plant_is_named_on_every_command_that_takes_one(no_figures, tmp_path, monkeypatch, capsys):
     write(tmp_path, CONFIGURED_CELL, "cell.py")
     assert command(monkeypatch, "plants", "./cell.py", "--json") == 0

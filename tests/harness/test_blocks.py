@@ -48,7 +48,6 @@ def alone(tmp_path_factory) -> pd.DataFrame:
     return judged(runs)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("block", "workers"), [(7, 1), (1000, 1), (1000, 2)])
 def test_rows_do_not_depend_on_the_blocks_and_those_of_a_block_have_no_times(alone, tmp_path, block, workers):
     carry_out(CAMPAIGN, tmp_path / "out", Execution(workers, block=block))

@@ -5,7 +5,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from kit.plants import factory_ur5, nominal_ur5
-from servobench.plant.cameras.symbolic import HandEyeGeometry, feature_and_jacobian, symbolic_feature
+from servobench.fmus.export import arm_layout
+from servobench.fmus.sources import core_functions
+from servobench.fmus.variables import Actuation, parameters_of
+from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.arm import (
     CALIBRATION_BLOCKS,
@@ -98,14 +101,17 @@ def random_model(seed, n=6):
     "model", [nominal_ur5(), *(random_model(seed, n) for seed, n in enumerate((6, 6, 6, 2, 3, 7, 8)))]
 )
 def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
-    q = casadi.SX.sym("q", model.arm.n)
-    feature, jacobian = feature_and_jacobian(q, HandEyeGeometry.of(model))
-    automatic = casadi.jacobian(symbolic_feature(model)(q), q)
-    function = casadi.Function("all", [q], [feature, jacobian, automatic])
-    for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, model.arm.n)):
-        y, J, derived = (np.asarray(value) for value in function(pose))
-        np.testing.assert_allclose(y[:, 0], model.feature(pose), rtol=0, atol=1e-12)
-        np.testing.assert_allclose([J, derived], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12)
+    n, layout = model.arm.n, arm_layout(model.arm.n)
+    q, values = casadi.SX.sym("q", n), parameters_of(model, Actuation(0.05, 1.0, 2 * np.pi, np.zeros(n)))
+    p = casadi.DM(np.concatenate([np.ravel(values[group.name]) for group in layout.kinematic]))
+    exported_feature, exported_jacobian, _ = core_functions(layout)
+    feature = symbolic_feature(model)(q)
+    outputs = [feature, casadi.jacobian(feature, q), exported_feature(q, p)[:3], exported_jacobian(q, p)]
+    function = casadi.Function("all", [q], outputs)
+    for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, n)):
+        y, J, exported_y, exported_J = (np.asarray(value) for value in function(pose))
+        np.testing.assert_allclose([y, exported_y], [model.feature(pose)[:, None]] * 2, rtol=0, atol=1e-12)
+        np.testing.assert_allclose([J, exported_J.reshape(3, n)], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12)
 
 
 def test_rotations_are_rotations_in_the_urdf_order():
