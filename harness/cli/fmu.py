@@ -143,22 +143,24 @@ def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
     from rich.table import Table
 
-    from servobench.fmus.inspection import read_information
+    from servobench.fmus.inspection import read_information, shape_of
 
     try:
         information = read_information(file)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
-    say(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
-    say(f"made by {information.tool}; token {information.token}")
+    described = information.description
+    say(f"{described.modelName}: FMI {described.fmiVersion}, {', '.join(information.interfaces)}")
+    token = described.guid or described.instantiationToken
+    say(f"made by {described.generationTool or 'unknown'}; token {token}")
     sources = "; with sources" if information.has_sources else ""
     say(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     for name, capabilities in information.interfaces.items():
         say(f"capabilities in {name}: {', '.join(capabilities) or 'none'}")
     table = Table("name", "causality", "size", "unit", "start")
-    for variable in information.variables:
-        size = " × ".join(map(str, variable.shape)) or "1"
-        table.add_row(variable.name, variable.causality, size, variable.unit, _shortened(variable.start))
+    for each in described.modelVariables:
+        size = " × ".join(map(str, shape_of(each))) or "1"
+        table.add_row(each.name, each.causality or "local", size, each.unit or "", _shortened(str(each.start or "")))
     console.print(table)
 
 
