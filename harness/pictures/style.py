@@ -75,6 +75,11 @@ class Layout:
     pixels: int
     density: float
 
+    @property
+    def scale(self) -> float:
+        """Pixels of a page for an inch."""
+        return self.pixels / self.width
+
 
 WIDE = Layout(WIDTH, 3, 1000, 1.5)
 
@@ -292,7 +297,7 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
 
     The picture is as high as what is drawn: nothing is cut, and there is no empty strip.
     """
-    large, small, scale = io.BytesIO(), io.BytesIO(), layout.pixels / layout.width  # [px/in]
+    large, small = io.BytesIO(), io.BytesIO()
     with figure_style(TEXT):
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)  # once, also for the edges of what is drawn
@@ -300,12 +305,12 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
         drawn = figure.get_tightbbox()
         low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
         box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
-        figure.savefig(large, dpi=layout.density * scale, bbox_inches=box)
+        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
     # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:
         indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         indexed.save(small, "PNG", optimize=True)
-    return small.getvalue(), round(scale * box.width), round(scale * box.height)
+    return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
 
 
 class Drawing(NamedTuple):
