@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -16,6 +18,7 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
+from kit.documents import tables as page_tables
 from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
 from page_studies.pictures import README
 from page_studies.study import ENGINES, Study, nothing, sweep
@@ -283,3 +286,20 @@ def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
     page = toy / "page.md"
     page.write_text("<!-- table: nothing -->\n\nas it was\n\n<!-- end -->\n")
     assert generated_tables.renewed(page) == page.read_text()
+
+
+def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
+    command = [sys.executable, "benchmarks/page.py", "--quick", "--out", tmp_path, "--only", "limits", "shares"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "performance.md").read_text(encoding="utf-8")
+    limits, shares = (rows for _, _, rows in page_tables(page))
+    assert limits[-1][0] == "the package, a block of 4"
+    sides = {row[0] for row in shares}
+    assert sides == {"single runs", "side by side"}
+    assert len(shares) == 10
+    for row in shares:
+        parts, whole = map(float, row[2:-1]), float(row[-1])
+        assert abs(sum(parts) - whole) < 0.5
+    assert "(pictures/performance_shares.png)" in page
+    assert (tmp_path / "pictures" / "performance_shares.png").stat().st_size < 100e3

@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 import pytest
 
-from kit.foreign_fmu import build_crane, describe_exchange
+from kit.foreign_fmu import build_crane, describe_exchange, mapping
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
 from servobench.fmus.export import default_actuation
@@ -32,16 +32,9 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
 
 TRUE_ARM, NOMINAL_ARM = (0.6, 0.3), (0.55, 0.4)
-MAPPING = """
-file = "crane.fmu"
-inputs = ["push.slew", "push.luff"]
-features = ["place.slew", "place.luff"]
-joints = ["wheel.slew", "wheel.luff"]
-[parameters]
-"arm.slew" = 0.6
-"arm.luff" = 0.3
-[limits]
-max_joint_speed = 2.0
+MAPPING = f"""{mapping(2)}
+parameters = {{"arm.slew" = 0.6, "arm.luff" = 0.3}}
+limits = {{max_joint_speed = 2.0}}
 """
 NOMINAL = '[nominal]\n"arm.slew" = 0.55\n"arm.luff" = 0.4\n'
 STATES = '[truth]\nstates = ["wheel.slew", "wheel.luff"]\n'
@@ -141,6 +134,7 @@ def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_ar
     assert steps["jacobian_error"].notna().sum() > 20
 
 
+@pytest.mark.slow
 def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     path = mapped(tmp_path, MAPPING + NOMINAL)
     experiment = build_experiment(request(path, "constant"), quiet(path))

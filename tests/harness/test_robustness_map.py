@@ -97,6 +97,7 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
     assert upright == [pytest.approx(1000.0 * limits["pid+true"])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "predicted"), [("kinematic", ["constant"]), pytest.param("mujoco", [], marks=NEEDS_MUJOCO)]
 )
