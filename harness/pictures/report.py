@@ -22,7 +22,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.analysis import groups
+from servobench.harness.analysis import tables
 from servobench.harness.analysis.comparison import (
     handy_unit,
     in_handy_units,
@@ -81,7 +81,7 @@ ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<hig
 NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
 BREAKS: Final = re.compile(r"([_:+=/,.])")  # signs after which a long name may go on in the next line
 TICKED: Final = re.compile(r"`([^`]*)`")
-CONTROLLER: Final = (groups.WHICH, "controller")
+CONTROLLER: Final = (tables.WHICH, "controller")
 INFINITE: Final = "∞"
 LENGTHY: Final = 24  # letters of a word that may be broken anywhere
 FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
@@ -153,8 +153,8 @@ def _picture(kind: str, title: str, tasks: tuple[str, ...], wide: Figure, narrow
 def _page(folder: Path, runs: pd.DataFrame) -> str:
     views, shown = path_views(folder, runs), _shown(runs)
     style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
-    numbered, facts = groups.runs_table(shown), describe_folder(folder, runs)
-    numbered.insert(0, (groups.WHICH, "run"), shown.index.to_list())
+    numbered, facts = tables.runs_table(shown), describe_folder(folder, runs)
+    numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -168,7 +168,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         policy=_policy(style, scripts),
         style=Markup(style),
         scripts=[Markup(script) for script in scripts],
-        groups=groups,
+        tables=tables,
         long_table=LONG_TABLE,
         missing=results.describe_missing(folder),
         verdict=judge(runs),
@@ -231,7 +231,7 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
     scales = {name: shown_unit(name, shown)[1] for name in known}
     place = shown.groupby(
-        ["controller", *(n for n in ("task", *groups.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
+        ["controller", *(n for n in ("task", *tables.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
         dropna=False,
     ).ngroup()
     runs = {
@@ -361,7 +361,7 @@ class Sheet(NamedTuple):
 
 def sheet(table: pd.DataFrame) -> Sheet:
     """Return the columns of a table, which are headings or pairs (group, heading)."""
-    columns = [name if isinstance(name, tuple) else (groups.WHICH, str(name)) for name in table]
+    columns = [name if isinstance(name, tuple) else (tables.WHICH, str(name)) for name in table]
     spans = [(group, len(list(own))) for group, own in groupby(str(group) for group, _ in columns)]
     units = [str(heading).partition(" [") for _, heading in columns]
     size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"
