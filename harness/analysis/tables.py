@@ -240,10 +240,8 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     """Yield the summary of a sweep, for each plant and task.
 
     That is the share of settled runs, or of those that followed their curve, a row for each condition; and where there
-    are others, the share of each outcome over all conditions.
-
-    Args:
-        parts: pieces of the table of runs; only numbers of runs are kept of each.
+    are others, the share of each outcome over all conditions. Of each part of the table of runs only numbers of runs
+    are kept.
     """
     counted, curves = [], set[str]()
     for part in parts:

@@ -98,14 +98,7 @@ class Picture(NamedTuple):
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the report on a results folder.
-
-    Args:
-        folder: a results folder.
-        path: the page; by default `report.html` in the folder.
-
-    Returns:
-        The page's path.
+    """Write the report on a results folder, by default `report.html` in it, and return its path.
 
     Raises:
         ConfigurationError: not a results folder, no run in it, or the page cannot be written.
@@ -278,10 +271,6 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
 
     Of many runs each has few points: each is the largest error of the periods for which it stands. Of more runs than
     fit into a page, the first ones have a curve.
-
-    Args:
-        folder: a results folder.
-        runs: those wanted, in the order in which they matter.
     """
     least, most = CURVE_POINTS
     wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
@@ -303,9 +292,9 @@ def _curve(steps: pd.DataFrame, feature_unit: str | None, points: int) -> Json:
     return {"end": rounded(float(steps["time_s"].iloc[-1])), "unit": unit, "error": error}
 
 
-def rounded(value: float, digits: int = DIGITS) -> float | None:
+def rounded(value: float) -> float | None:
     """Return a number with few digits for JSON, None where it is not finite."""
-    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+    return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
 
 
 def _view(title: str, tracks: Tracks) -> Json:

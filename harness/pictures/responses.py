@@ -100,11 +100,7 @@ def draw_features(
 ) -> Figure:
     """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
 
-    Args:
-        tasks: task -> controller -> run.
-        until: task -> the time at which its column ends [s].
-        styles: controller -> style.
-        layout: of the figure; a narrow one is for a single task.
+    The column of a task ends at `until[task]` [s]. A narrow layout is for a single task.
     """
     features = _features(tasks)
     figure = Figure(figsize=(layout.width, 1.1 + 1.3 * len(features)), layout="constrained")
@@ -222,14 +218,7 @@ def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles)
 def draw_over_seeds(
     axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles, curve: Callable[[Ensemble], FloatArray]
 ) -> None:
-    """Draw the median of a curve over seeds, and between which values most seeds are.
-
-    Args:
-        axes: where.
-        ensembles: controller -> its runs.
-        styles: controller -> style.
-        curve: of an ensemble, (r, k).
-    """
+    """Draw the median over seeds of a curve of each ensemble, (r, k), and between which values most seeds are."""
     for name, ensemble in ensembles.items():
         values, style = curve(ensemble), styles[name]
         low, middle, high = (quantile(values, share) for share in BAND)
@@ -278,12 +267,9 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
 
 
 def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
-    """Draw the commanded joint motion of one run of each controller; None without commands.
+    """Draw the commanded joint motion of one run of each controller until a time [s]; None without commands.
 
-    Args:
-        tracks: controller -> run.
-        until: the time at which the figure ends [s]; a long run is shown at its end.
-        layout: of the figure; three columns need a wide one.
+    A long run is shown at its end. Three columns need a wide layout.
     """
     shown = each(Track.closing, tracks)
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)

@@ -319,12 +319,9 @@ class SmallLoop:
     """A composed controller, frozen at its rest, on the kinematic plant without noise."""
 
     def __init__(self, warm: Warm, model: HandEyeModel, config: KinematicConfig) -> None:
-        """Freeze the controller, whose estimator returns the true Jacobian at every posture.
+        """Freeze a composed controller, whose estimator returns the true Jacobian of `model` at every posture.
 
-        Args:
-            warm: the composed controller after its warm-up.
-            model: the true robot.
-            config: of the plant; its noise and lost frames are left out.
+        Noise and lost frames of the plant are left out.
         """
         servo, state, self._rest = at_rest(warm, "true")
         self._servo, self._state = frozen(servo, state, model.jacobian)
@@ -332,12 +329,7 @@ class SmallLoop:
         self.latency = config.sensing.latency
 
     def is_stable(self, factor: float = 1.0, latency: float | None = None) -> bool:
-        """Return whether small motions die out.
-
-        Args:
-            factor: on the command.
-            latency: of the camera [s]; None for that of the plant's settings.
-        """
+        """Return whether small motions die out with a factor on the command and another latency of the camera [s]."""
         moved, rested = (self._features(factor, latency, offset) for offset in (OFFSET, 0.0))
         errors = np.linalg.norm(moved - rested - OFFSET, axis=-1)
         length = len(errors) // WINDOWS
