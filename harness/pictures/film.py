@@ -139,7 +139,6 @@ def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Ite
         process = subprocess.Popen(
             call, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
         )
-
         pipe = cast("IO[bytes]", process.stdin)
 
         def write(frame: ByteArray) -> None:

@@ -128,21 +128,18 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
             axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
         return figure
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
-    heads = divisions(ensembles)
+    heads, closing = divisions(ensembles), each(Track.closing, tracks)
     figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
     panels = figure.subplots(
         1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
         height_ratios=[2.2, *[1.0] * len(features)],
     )  # fmt: skip
-    closing = each(Track.closing, tracks)
     for column, (head, names) in zip(panels.T, heads.items(), strict=True):
         draw_error(column[0], {name: ensembles[name] for name in names}, styles)
-        column[0].set_title(head)
-        column[0].set_ylabel(f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
+        column[0].set(title=head, ylabel=f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
         shown = {name: closing[name] for name in names if name in closing}
-        for axes, feature in zip(column[1:], features, strict=True):
-            if shown:
-                draw_feature(axes, shown, styles, feature)
+        for axes, feature in zip(column[1:], features, strict=True) if shown else ():
+            draw_feature(axes, shown, styles, feature)
         column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
         if long:
             column[0].set_xlabel("time [s]")
