@@ -16,13 +16,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import (
-    POINT_TO_POINT,
-    handy_unit,
-    settling_times,
-    texts_of,
-    with_places,
-)
+from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, texts_of, with_places
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
