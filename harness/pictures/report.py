@@ -278,10 +278,10 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     curves: dict[str, Json] = {}
     for first in range(0, len(wanted), STEPS_AT_ONCE) if results.has_steps(folder) else ():
         part = wanted[first : first + STEPS_AT_ONCE]
-        tables = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
+        steps = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
         for run_id, feature_unit in zip(part["run_id"], texts_of(part, "feature_unit"), strict=True):
-            if run_id in tables:
-                curves[run_id] = _curve(tables[run_id], feature_unit, points)
+            if run_id in steps:
+                curves[run_id] = _curve(steps[run_id], feature_unit, points)
     return curves
 
 
