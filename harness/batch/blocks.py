@@ -375,11 +375,6 @@ SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker a
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
 
 
-def default_workers() -> int:
-    """Return the number of worker processes that are used where none is given."""
-    return min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
-
-
 def can_travel(own: Sequence[Offer]) -> bool:
     """Return whether a worker process can receive controllers and plants that users gave."""
     try:
@@ -418,7 +413,7 @@ def open_workers(
     """
     if scheduler is not None and count is not None:
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
-    count = count or default_workers()
+    count = count or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:

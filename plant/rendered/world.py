@@ -24,7 +24,7 @@ from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.detectors import open_detector
 from servobench.plant.rendered.drives import PHYSICS_STEP
-from servobench.plant.rendered.engine import Engine, Joints, Machine, Overlap
+from servobench.plant.rendered.engine import Engine, Machine, Overlap
 from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.arm import SerialArm
@@ -91,7 +91,7 @@ class RenderedState:
         noise: of the detector.
     """
 
-    joints: Joints
+    joints: Any
     periods: int
     camera: FloatArray
     noise: Any

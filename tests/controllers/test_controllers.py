@@ -78,6 +78,7 @@ def random_run(controller, spec, seed, scale, steps=12, start=True):
 @pytest.mark.parametrize("entry", ALL)
 @settings(max_examples=8, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-3, 6))
+@pytest.mark.slow
 def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n, m, seed, exponent):
     knowledge = robot(n, m, seed)
     controller = entry.build(default_config(entry), knowledge)

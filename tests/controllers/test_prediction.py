@@ -30,11 +30,6 @@ def answered(response, steps=40, length=4, joints=3):
     return made, commands
 
 
-def test_the_response_of_the_joints_is_found():
-    made, _ = answered(RESPONSE)
-    np.testing.assert_allclose(made.response, RESPONSE, atol=0.01)
-
-
 def test_flight_and_lead_are_what_is_still_to_come():
     """Of the newest command nothing is done, of the one before 0.4 is left, of that before 0.1: lead = 1.5 periods."""
     made, commands = answered(RESPONSE)
@@ -259,25 +254,6 @@ def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     np.testing.assert_allclose(moved[-1], steps.sum(axis=0), atol=1e-5)
 
 
-def test_each_half_alone_makes_up_for_its_part():
-    """`delay` brings the feature to the present, `response` to where the commands so far will lead."""
-    rng = np.random.default_rng(0)
-    made = {
-        "delay": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5), 2), Delays(0.1, 0.0, 0.0), delay="given"),
-        "response": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5)), NO_DELAYS, response="identified"),
-    }
-    for k in range(40):
-        step = 0.05 * rng.uniform(-1.0, 1.0, N)
-        for half, each in made.items():
-            bound = each.predict()
-            if k > 20:
-                expected = each.arm.end() if half == "response" else A @ each.arm.q
-                np.testing.assert_allclose(bound.feature, expected, atol=1e-3)
-                assert (bound.lead > 1.0) == (half == "response")
-                np.testing.assert_array_equal(bound.joint_position == each.look.joint_position, half == "delay")
-            each.send(step)
-
-
 def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     made = Seeing(ToyArm(np.eye(M)), delay="identified", filter=True)
     for k in range(8):
@@ -298,12 +274,6 @@ def test_the_shifted_reference_is_interpolated_and_goes_on():
     for lead, expected in ((0.0, [0.0, 1.0]), (1.5, [2.5, 4.5]), (2.25, [4.25, 5.25]), (7.5, [9.5, 10.5])):
         np.testing.assert_allclose(shifted(reference, np.array(lead), 2)[:, 0], expected)
     np.testing.assert_allclose(shifted(reference[:1], np.array(1.5), 1), [[0.0]])
-
-
-def test_every_lane_has_its_own_shift():
-    reference, leads = np.random.default_rng(0).normal(size=(3, 6, 2)), np.array([0.0, 1.5, 8.25])
-    single = [shifted(one, lead, 4) for one, lead in zip(reference, leads, strict=True)]
-    np.testing.assert_array_equal(shifted(reference, leads, 4), single)
 
 
 def test_the_nominal_model_is_asked_only_where_a_stage_predicts_with_it():

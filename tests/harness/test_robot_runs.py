@@ -93,6 +93,7 @@ def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
         resolve(PANDA, Settings())
 
 
+@pytest.mark.slow
 def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
     experiment = build_experiment(request, Settings())
