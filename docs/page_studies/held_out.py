@@ -28,8 +28,8 @@ from page_studies.study import (
 from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.batch.results import load_runs
-from servobench.harness.config.defaults import default_config, tuned_file
 from servobench.harness.config.registry import find_controller
+from servobench.harness.config.settings import default_config, tuned_file
 
 Cell = Callable[[pd.DataFrame], str]
 PAIRS: Final = [(BETTER, name) for name in BOTH if name != BETTER] + [

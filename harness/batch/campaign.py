@@ -163,10 +163,10 @@ def _carry_out_at(
         else:
             results.create_folder(folder, manifest)
         if not resumed or not results.is_whole(folder, runs.count):
-            for index, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
+            for block, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
                 with writing(folder):
                     lock.check()  # the folder may have been removed
-                results.write_part(folder, index, outcome, manifest["campaign"])
+                results.write_part(folder, block.index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
         results.put_together(folder, manifest)
 
@@ -255,8 +255,8 @@ def _carry_out_missing(
     folder: Path,
     place: Workers,
     how: Execution,
-) -> Iterator[tuple[int, list[RunResult]]]:
-    """Carry out the runs whose part is not in the folder; yield the results of each block with its first index."""
+) -> Iterator[tuple[Block, list[RunResult]]]:
+    """Carry out the runs whose part is not in the folder; yield each block with its results."""
     total = len(campaign.cells)
     done = results.finished_runs(folder)
     missing = total - sum(map(len, done))
@@ -269,8 +269,7 @@ def _carry_out_missing(
         own,
     )
     keep = folder if campaign.steps and not place.cluster else None
-    for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
-        yield block.index, outcome
+    return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
 
 
 def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: bool) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offering
+from servobench.harness.config.settings import default_config
 from servobench.harness.run.contract import HeldController
 from servobench.plant.contract.faults import ConfigurationError
 

@@ -45,8 +45,8 @@ def controllers(
     """List the controllers, or show the settings of one."""
     from servobench.controllers.parts import ESTIMATORS, LAWS
     from servobench.harness.batch.trials import choose
-    from servobench.harness.config.defaults import default_config
     from servobench.harness.config.registry import find_controller
+    from servobench.harness.config.settings import default_config
 
     if name:
         name = choose("controller", name)

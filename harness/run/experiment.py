@@ -20,10 +20,9 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunRequest, RunSettings

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import (
     controller_names,
     find_controller,
@@ -16,7 +15,7 @@ from servobench.harness.config.registry import (
     plant_names,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import Settings, nest
+from servobench.harness.config.settings import Settings, default_config, nest
 from servobench.harness.run.request import RunRequest, RunSettings, Varied
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names

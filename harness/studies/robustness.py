@@ -23,10 +23,9 @@ from servobench.harness.analysis.statistics import Estimate, median_with_interva
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import (
     TEXT,

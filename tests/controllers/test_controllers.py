@@ -21,7 +21,7 @@ from servobench.controllers.networks.fit import train
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.check.controllers import ControllerChecks
-from servobench.harness.config.defaults import default_config
+from servobench.harness.config.settings import default_config
 from servobench.plant.contract.signals import Observation
 
 PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]

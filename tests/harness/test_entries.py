@@ -11,8 +11,8 @@ import servobench
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.batch import trials
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered
+from servobench.harness.config.settings import default_config
 from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}

@@ -11,9 +11,8 @@ import pytest
 from kit.command import judged
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
