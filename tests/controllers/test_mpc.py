@@ -7,8 +7,7 @@ import pytest
 from kit.toy import PERIOD, Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate
-from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
-from servobench.controllers.laws.mpc.closed_form import UnlimitedPlan, move_weights
+from servobench.controllers.laws.mpc.closed_form import Blocks, UnlimitedPlan, bridging_shares, move_weights
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, exceeds, view_rows
 from servobench.plant.contract.faults import SolverFailed

@@ -13,7 +13,7 @@ from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.joint_response import JointResponse, with_response
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.prediction import FeatureFilter, Past, Predictor, shifted
+from servobench.controllers.stages.prediction import FeatureFilter, Predictor, shifted
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 NO_DELAYS = Delays(0.0, 0.0, 0.0)
@@ -200,8 +200,7 @@ class Seeing:
     def predict(self):
         self.estimation = self.stages.update(self.estimation, self.look, np.zeros(M))
         pair, pairing = self.estimation.learned.pair, self.stages.pairing
-        window = self.look.joint_position - pair.past[self.predictor.window, :N]
-        past = Past(pairing.delay(pair), *pairing.exposed(pair), window)
+        past = pairing.past(pair, self.look.joint_position, self.predictor.window)
         self.state, bound = self.predictor.predict(self.state, A, past, self.look)
         return bound
 
@@ -263,9 +262,10 @@ def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     learned = made.estimation.learned._replace(pair=pair._replace(candidate=np.int_(3)))
     made.estimation = made.estimation._replace(learned=learned)
     made.look = seen(made.look.joint_position, np.array([0.5, 0.1, -0.2]), valid=False, k=8)
-    exposed, _ = made.stages.pairing.exposed(made.stages.pairing.advance(learned.pair, made.look.joint_position))
+    pairing, at = made.stages.pairing, made.look.joint_position
+    past = pairing.past(pairing.advance(learned.pair, at), at, 1)
     bound = made.predict()
-    np.testing.assert_allclose(bound.feature, made.look.feature + A @ (made.look.joint_position - exposed))
+    np.testing.assert_allclose(bound.feature, made.look.feature + A @ (at - past.exposed))
     assert made.state.delay == made.stages.pairing.delays[3]
 
 
