@@ -9,14 +9,16 @@ block     Bench.step of many runs side by side, for each of them
 from __future__ import annotations
 
 import ctypes
+import itertools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import cast
 
 import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
-from measuring import asked_to_be_quick, table
+from measuring import asked_to_be_quick, table, times_in_turns
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
@@ -43,14 +45,9 @@ def open_plant(runs: int = 0) -> Bench:
     return build_ur5(config, PlantSetup(model, start, PERIOD))
 
 
-def fmu_world(plant: Bench) -> FmuWorld:
-    """Return the FMU on the bench."""
-    return cast(FmuWorld, plant.world)
-
-
 def bare_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by three calls with prebuilt arguments."""
-    world = fmu_world(plant)
+    world = cast(FmuWorld, plant.world)
     instance = world._instances.lanes[0].instance
     library, component = instance._library, instance._component
     set_real, inputs = library.fmi2SetReal, (*world._command.variables, world._command.pointer())
@@ -68,7 +65,7 @@ def bare_calls(plant: Bench) -> Callable[[int], None]:
 
 def fmpy_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by fmpy's own methods."""
-    world = fmu_world(plant)
+    world = cast(FmuWorld, plant.world)
     description = world.description
     slave = FMU2Slave(
         guid=description.token,
@@ -107,26 +104,20 @@ def main() -> None:
     """Measure in turns, so that a disturbance meets all alike, and print the best round of each and ratios."""
     rounds = 2 if asked_to_be_quick(__doc__) else 300
     plants = [*(open_plant() for _ in range(3)), open_plant(BLOCK)]
-    bare, whole, fmpy, block = (
-        BARE,
-        "`Bench.step`, one run",
-        "fmpy's `FMU2Slave`",
-        f"`Bench.step`, {BLOCK} runs side by side",
-    )
-    calls = {bare: bare_calls(plants[0]), whole: plant_steps(plants[1]), fmpy: fmpy_calls(plants[2]),
-             block: plant_steps(plants[3])}  # fmt: skip
-    shares = {name: BLOCK if name == block else 1 for name in calls}
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for round_ in range(rounds):
-        for name, call in calls.items():
-            count = CALLS // shares[name]
-            started = time.perf_counter()
-            for k in range(round_ * count, (round_ + 1) * count):
-                call(k)
-            times[name].append((time.perf_counter() - started) / count / shares[name])
-    best = {name: min(values) * 1e6 for name, values in times.items()}
+    block = f"`Bench.step`, {BLOCK} runs side by side"
+    steps = {BARE: bare_calls(plants[0]), "`Bench.step`, one run": plant_steps(plants[1]),
+             "fmpy's `FMU2Slave`": fmpy_calls(plants[2]), block: plant_steps(plants[3])}  # fmt: skip
+    instants = {name: itertools.count() for name in steps}
+
+    def many(name: str) -> None:
+        for k in itertools.islice(instants[name], CALLS // BLOCK if name == block else CALLS):
+            steps[name](k)
+
+    times = times_in_turns({name: partial(many, name) for name in steps}, rounds, time.perf_counter)
+    runs = {name: CALLS // BLOCK * BLOCK if name == block else CALLS for name in steps}
+    best = {name: min(values) / runs[name] * 1e6 for name, values in times.items()}
     print(table(["step of the FMU of the UR5", "a step", "× bare calls"],
-                [[name, f"{value:.2f} µs", f"{value / best[bare]:.2f}"] for name, value in best.items()]))  # fmt: skip
+                [[name, f"{value:.2f} µs", f"{value / best[BARE]:.2f}"] for name, value in best.items()]))  # fmt: skip
     for plant in plants:
         plant.close()
 

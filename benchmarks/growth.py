@@ -7,14 +7,11 @@ measured here, as is that of the scheduler. Workers are taken to be as fast as h
 from __future__ import annotations
 
 import os
-import resource
-import subprocess
 import sys
-import tempfile
 import time
 from typing import Any, NamedTuple
 
-from measuring import FIRST_SEED, METHODS, PERIODS, asked_to_be_quick, table
+from measuring import METHODS, PERIODS, asked_to_be_quick, seeds, sweep_times, table
 
 CORES = (1, 2, 16, 128, 1000)
 # Dask has its workers return freed memory at once; arrays of a block would be mapped anew in every period.
@@ -31,13 +28,9 @@ class Cost(NamedTuple):
 
 def sweep(cluster: Any, robots: int) -> Cost:  # noqa: ANN401 - of Dask
     """Return what a sweep over all methods takes; the scheduler lives in this process."""
-    with tempfile.TemporaryDirectory() as scratch:
-        names = "sweep", "--controllers", ",".join(METHODS), "--scheduler", cluster.scheduler_address
-        seeds = "--seeds", f"{FIRST_SEED}:{FIRST_SEED + robots}", "--out", f"{scratch}/sweep"
-        before, used, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.process_time(), time.perf_counter()
-        subprocess.run([sys.executable, "-m", "servobench", *names, *seeds], capture_output=True, check=True)
-        wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    parent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    names = "sweep", "--controllers", ",".join(METHODS), "--scheduler", cluster.scheduler_address
+    used = time.process_time()
+    parent, wall = sweep_times([sys.executable, "-m", "servobench", *names, "--seeds", seeds(robots)])
     return Cost(wall, parent, time.process_time() - used)
 
 

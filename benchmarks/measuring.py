@@ -1,11 +1,14 @@
-"""Shared parts of the benchmarks: the methods, processor time, tables in Markdown, fitted exponents and pictures."""
+"""Shared parts of the benchmarks: options, the methods, times, tables in Markdown, fitted exponents and pictures."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import resource
+import subprocess
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,11 +21,18 @@ FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110
 
 
+def options(description: str | None, **further: dict[str, Any]) -> argparse.Namespace:
+    """Return the options of a benchmark: `quick`, for a test of the page, and `further` ones with their keywords."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few runs only: test the page, not the speed")
+    for name, keywords in further.items():
+        parser.add_argument(f"--{name}", **keywords)
+    return parser.parse_args()
+
+
 def asked_to_be_quick(description: str | None) -> bool:
-    """Return whether `--quick` was given, for a test of the page."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--quick", action="store_true", help="test the page, not the speed")
-    return bool(parser.parse_args().quick)
+    """Return whether `--quick` was given, the only option."""
+    return bool(options(description).quick)
 
 
 def resolved_runs(plant: str, method: str, count: int, duration: float | None = None) -> list[Any]:
@@ -47,11 +57,35 @@ def processor_time(call: Callable[[], object], calls: int, rounds: int = 3) -> f
     return min(times)
 
 
-def milliseconds(call: Callable[[], object]) -> float:
-    """Return the processor time of a call [ms], of all its threads: that of a renderer's, too."""
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
+def times_in_turns(
+    calls: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.process_time
+) -> dict[str, list[float]]:
+    """Return the times of each call [s], a number a round: calls take turns, so that a disturbance meets all alike.
+
+    Processor time is that of all threads, also of a renderer's, and leaves other work out.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            began = clock()
+            call()
+            times[name].append(clock() - began)
+    return times
+
+
+def sweep_times(command: Sequence[str], **surroundings: Any) -> tuple[float, float]:  # noqa: ANN401
+    """Return the processor time with all processes, and the wall-clock time, of a sweep into a scratch folder [s]."""
+    with tempfile.TemporaryDirectory() as scratch:
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        whole = [*command, "--out", f"{scratch}/sweep"]
+        subprocess.run(whole, capture_output=True, check=True, **surroundings)
+        ended, after = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, ended - began
+
+
+def seeds(count: int) -> str:
+    """Return the range of so many seeds."""
+    return f"{FIRST_SEED}:{FIRST_SEED + count}"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
 
-from measuring import asked_to_be_quick, milliseconds, table
+from measuring import asked_to_be_quick, table, times_in_turns
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
@@ -139,8 +140,8 @@ def rows(make: Callable[[RenderedConfig, ExitStack], Calls], repeats: int) -> li
         with ExitStack() as opened:
             calls = make(config, opened)
             speeds = [0.2 * np.sin(0.3 * k) * np.ones(6) for k in range(repeats)]
-            times = [[milliseconds(lambda call=call, u=u: call(u)) for call in calls.values()] for u in speeds]
-        medians = np.median(times, axis=0)
+            rounds = [times_in_turns({name: partial(call, u) for name, call in calls.items()}, 1) for u in speeds]
+        medians = 1e3 * np.median([[time for (time,) in each.values()] for each in rounds], axis=0)
         for name, value in zip(calls, medians, strict=True):
             found.append([f"{name}, {place}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
     return found

@@ -6,7 +6,6 @@ any number of joints.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,25 +15,16 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.figure import Figure
 
-from measuring import (
-    METHODS,
-    PERIODS,
-    WIDTH,
-    exponent,
-    microseconds,
-    processor_time,
-    resolved_runs,
-    table,
-    write_picture,
-)
+import measuring
+from measuring import METHODS, PERIODS, microseconds, processor_time, resolved_runs
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.networks.rbf import JacobianNetwork
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
+from servobench.harness.config.settings import default_config
 from servobench.harness.pictures import style
 from servobench.harness.run.episode import carry_out_together
 from servobench.plant.contract.signals import Observation, PlantSpec, trusted_observation
@@ -62,7 +52,7 @@ def side_by_side(counts: Sequence[int]) -> Curves:
     """Return the cost of a period of whole runs, building and judging included."""
     curves: Curves = {}
     for method in METHODS:
-        runs = resolved_runs("kinematic", method, max(counts))
+        runs = resolved_runs("kinematic", method, max(*counts, 4))
         carry_out_together(runs[:1])
         costs = []
         for count in counts:
@@ -130,14 +120,15 @@ def curve(make: Callable[..., Callable[[], object]], lead: Lead, sizes: Sequence
     return list(sizes), [processor_time(make(lead, size, *more), calls) / (*lead, 1)[0] for size in sizes]
 
 
-def _sides(lead: tuple[int, ...]) -> str:
+def sides(lead: Lead) -> str:
+    """Return how many runs are side by side, in words."""
     return f"{lead[0]} runs" if lead else "one run"
 
 
 def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
     """Draw a panel for each size."""
     with style.figure_style():
-        figure = Figure(figsize=(WIDTH, 6.4), layout="constrained")
+        figure = Figure(figsize=(measuring.WIDTH, 6.4), layout="constrained")
         for axes, (title, (unit, curves)) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
             styles = style.method_styles(label.split("`")[1] for label in curves)
             for label, (sizes, costs) in curves.items():
@@ -149,30 +140,27 @@ def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
             axes.minorticks_off()
             axes.set(title=title, xlabel=unit, ylabel="µs a run and period")
             axes.legend(fontsize=6.5)
-        write_picture(figure, path)
+        measuring.write_picture(figure, path)
 
 
 def main() -> None:
     """Print a table of exponents, and the picture's line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--picture", type=Path)
-    parser.add_argument("--quick", action="store_true", help="few sizes only, to test the page")
-    options = parser.parse_args()
-    count, calls = (2, 2) if options.quick else (None, 60)
+    given = measuring.options(__doc__, picture={"type": Path})
+    count, calls = (2, 2) if given.quick else (None, 60)
     sizes = {"units": (50, 100, 150, 300, 600), "horizon": (4, 7, 10, 20, 40), "joints": (3, 6, 12, 24)}
     units, horizons, joints = (each[:count] for each in sizes.values())
     both = (), (BLOCK,)
     panels = {
         "runs side by side": ("runs", side_by_side([2**i for i in range(10)][:count])),
         "units of a network": ("units a joint column", {
-            f"`rbf`, {_sides(lead)}": curve(network, lead, units, calls) for lead in both
+            f"`rbf`, {sides(lead)}": curve(network, lead, units, calls) for lead in both
         }),
         "horizon": ("periods", {
-            **{f"`mpc`, no limit active, {_sides(lead)}": curve(plan, lead, horizons, calls, 0.01) for lead in both},
+            **{f"`mpc`, no limit active, {sides(lead)}": curve(plan, lead, horizons, calls, 0.01) for lead in both},
             "`mpc`, limits active, one run": curve(plan, (), horizons, calls, 1.0),
         }),
         "joints": ("joints", {
-            f"`{method}`, {_sides(lead)}": curve(loop, lead, joints, calls, method)
+            f"`{method}`, {sides(lead)}": curve(loop, lead, joints, calls, method)
             for method in ("broyden", "ukf_mfac", "ukf_mpc") for lead in both
         }),
     }  # fmt: skip
@@ -180,13 +168,13 @@ def main() -> None:
     for title, (_, curves) in panels.items():
         for label, (over, costs) in curves.items():
             ends = f"{microseconds(costs[0])} … {microseconds(costs[-1])} µs"
-            power = f"{exponent(over, costs):+.2f}"
+            power = f"{measuring.exponent(over, costs):+.2f}"
             if len(over) > 5:
-                power += f"; from 64 on {exponent(over[-4:], costs[-4:]):+.2f}"
+                power += f"; from 64 on {measuring.exponent(over[-4:], costs[-4:]):+.2f}"
             rows.append([title, f"{over[0]} … {over[-1]}", label, ends, power])
-    print(table(["size", "from … to", "what", "a run and period", "exponent"], rows))
-    if options.picture:
-        draw(panels, options.picture)
+    print(measuring.table(["size", "from … to", "what", "a run and period", "exponent"], rows))
+    if given.picture:
+        draw(panels, given.picture)
 
 
 if __name__ == "__main__":

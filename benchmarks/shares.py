@@ -7,7 +7,6 @@ Functions are wrapped from outside; the time of one that is called within anothe
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from measuring import METHODS, PERIODS, WIDTH, resolved_runs, table, write_picture
+from measuring import METHODS, PERIODS, WIDTH, options, resolved_runs, table, write_picture
 from servobench.harness.pictures import style
 from servobench.harness.run import episode, log
 from servobench.harness.run.experiment import build
@@ -26,6 +25,13 @@ COLOURS = {
     "plant": style.BLUE, "truth": style.SKY, "estimator": style.VERMILION, "law": style.ORANGE, "aids": style.GREEN,
     "log": style.YELLOW, "judging": style.PURPLE, "building": style.WINE, "rest": "#BBBBBB",
 }  # fmt: skip
+SHARED = (
+    (episode, ("build", "build_together"), "building"),
+    (episode, ("judge_run", "_judge_together"), "judging"),
+    (log.StepLog, ("add", "steps"), "log"),
+    (Bench, ("reset", "step"), "plant"),
+    (Bench, ("truth",), "truth"),
+)  # functions that all methods share
 Costs = dict[str, dict[str, float]]  # [µs a period] by method and part
 
 
@@ -90,21 +96,6 @@ def measure(clock: Clock, runs: int, *, together: bool) -> Costs:
     return costs
 
 
-def started_clock() -> Clock:
-    """Return a clock of the functions that all methods share."""
-    clock = Clock()
-    for owner, names, part in (
-        (episode, ("build", "build_together"), "building"),
-        (episode, ("judge_run", "_judge_together"), "judging"),
-        (log.StepLog, ("add", "steps"), "log"),
-        (Bench, ("reset", "step"), "plant"),
-        (Bench, ("truth",), "truth"),
-    ):
-        for name in names:
-            clock.wrap(owner, name, part)
-    return clock
-
-
 def draw(sides: dict[str, Costs], path: Path) -> None:
     """Draw a panel for each side."""
     with style.figure_style():
@@ -127,11 +118,11 @@ def draw(sides: dict[str, Costs], path: Path) -> None:
 
 def main() -> None:
     """Print a table of the parts, and the picture's line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--picture", type=Path)
-    parser.add_argument("--quick", action="store_true", help="a few runs only, to test the page")
-    options = parser.parse_args()
-    clock, (runs, block) = started_clock(), (1, 4) if options.quick else (15, 128)
+    given = options(__doc__, picture={"type": Path})
+    clock, (runs, block) = Clock(), (1, 4) if given.quick else (15, 128)
+    for owner, names, part in SHARED:
+        for name in names:
+            clock.wrap(owner, name, part)
     sides = {
         "single runs": measure(clock, runs, together=False),
         "side by side": measure(clock, block, together=True),
@@ -142,8 +133,8 @@ def main() -> None:
         for method, parts in costs.items()
     ]
     print(table(["[µs a period]", "method", *COLOURS, "sum"], rows))
-    if options.picture:
-        draw(sides, options.picture)
+    if given.picture:
+        draw(sides, given.picture)
 
 
 if __name__ == "__main__":

@@ -9,16 +9,13 @@ subtracted from a large one: what is left is a run with its building, judging an
 
 from __future__ import annotations
 
-import argparse
 import os
-import resource
 import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
+from typing import Any
 
-from measuring import FIRST_SEED, METHODS, PERIODS, microseconds, table
+from measuring import METHODS, PERIODS, microseconds, options, seeds, sweep_times, table
 
 HERE = Path(__file__).resolve().parents[1]
 ALONE = """
@@ -38,23 +35,19 @@ print(time.process_time() - began)
 """
 
 
-def call(checkout: Path, *arguments: str) -> str:
-    """Return what a call of Python in a checkout prints."""
+def surroundings(checkout: Path) -> tuple[str, dict[str, Any]]:
+    """Return the Python of a checkout, its own where it has one, and the environment and folder of its processes."""
     own, packages = checkout / ".venv" / "bin" / "python", checkout / ".package"
     environment = {**os.environ, "PYTHONPATH": str(packages if packages.is_dir() else checkout), "OMP_NUM_THREADS": "1"}
-    command = [str(own if own.exists() and checkout != HERE else sys.executable), *arguments]
-    return subprocess.run(command, env=environment, cwd=checkout, capture_output=True, text=True, check=True).stdout
+    return str(own if own.exists() and checkout != HERE else sys.executable), {"env": environment, "cwd": checkout}
 
 
 def sweep(checkout: Path, plant: str, methods: str, robots: int, workers: int = 1) -> tuple[float, float]:
     """Return the processor time with all processes, and the wall-clock time, of a sweep [s]."""
+    python, around = surroundings(checkout)
     module = "servobench" if (checkout / ".package").is_dir() else "harness.command_line"
-    with tempfile.TemporaryDirectory() as scratch:
-        names = "-m", module, "sweep", "--plants", plant, "--controllers", methods, "--workers", str(workers)
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        call(checkout, *names, "--seeds", f"{FIRST_SEED}:{FIRST_SEED + robots}", "--out", f"{scratch}/sweep")
-        ended, after = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, ended - began
+    names = "-m", module, "sweep", "--plants", plant, "--controllers", methods, "--workers", str(workers)
+    return sweep_times([python, *names, "--seeds", seeds(robots)], **around)
 
 
 def period_in_sweep(checkout: Path, plant: str, method: str, few: int, many: int) -> float:
@@ -65,20 +58,20 @@ def period_in_sweep(checkout: Path, plant: str, method: str, few: int, many: int
 
 def period_alone(checkout: Path, plant: str, method: str, runs: int) -> float:
     """Return the processor time of a period of a run by itself [s]."""
-    return float(call(checkout, "-c", ALONE, plant, method, str(runs)).split()[-1]) / runs / PERIODS
+    python, around = surroundings(checkout)
+    command = [python, "-c", ALONE, plant, method, str(runs)]
+    printed = subprocess.run(command, **around, capture_output=True, text=True, check=True).stdout
+    return float(printed.split()[-1]) / runs / PERIODS
 
 
 def main() -> None:
     """Print a table of times and ratios, and the time of the whole."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--against", nargs="*", default=[], metavar="NAME=PATH", help="older checkouts")
-    parser.add_argument("--rounds", type=int, default=2, help="of this checkout; the best one counts")
-    parser.add_argument("--quick", action="store_true", help="a few runs only, to test the page")
-    options = parser.parse_args()
-    others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in options.against)}
+    against = {"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"}
+    given = options(__doc__, against=against, rounds={"type": int, "default": 2, "help": "of this checkout"})
+    others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in given.against)}
     plants, methods = ["kinematic", "fmu"], list(METHODS)
-    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 84), 15, options.rounds, 1000
-    if options.quick:
+    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 84), 15, given.rounds, 1000
+    if given.quick:
         plants, methods, counts, old_counts, alone, rounds, whole = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1, 10
     rows, totals = [], []
     for plant in plants:

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from measuring import asked_to_be_quick, table
+from measuring import asked_to_be_quick, table, times_in_turns
 from servobench.controllers.estimators.kalman import split_update
 from servobench.controllers.estimators.ukf import sigma_weights, unscented_update
 
@@ -21,6 +20,7 @@ M, N, MOTIONS, FACTOR, BLOCK = 3, 6, 200, 8.0, 128
 SIZE = M * N
 P0, q, r = 1e-2 * np.eye(SIZE), 4e-4, 2e-6
 Q, R = q * np.eye(SIZE), r * np.eye(M)
+BESIDE = f"split form, {BLOCK} runs side by side"
 WEIGHTS = sigma_weights(SIZE, 1.0, 2.0, 0.0)
 
 
@@ -40,20 +40,12 @@ def sigma_points(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     return J.ravel()
 
 
-def split(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Run the project's split filter and return vec(J)."""
-    J, P = np.zeros((M, N)), P0[:N, :N]
+def split(data: list[tuple[np.ndarray, np.ndarray]], lead: tuple[int, ...] = ()) -> np.ndarray:
+    """Run the project's split filter for runs side by side, or for one, and return vec(J) of the first."""
+    J, P = np.zeros((*lead, M, N)), np.broadcast_to(P0[:N, :N], (*lead, N, N)).copy()
     for dq, dy in data:
-        J, P = split_update(J, P, dq, dy, q=q, r=r)
-    return J.ravel()
-
-
-def split_block(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Do the same for many runs side by side and return vec(J) of the first."""
-    J, P = np.zeros((BLOCK, M, N)), np.tile(P0[:N, :N], (BLOCK, 1, 1))
-    for dq, dy in data:
-        J, P = split_update(J, P, np.tile(dq, (BLOCK, 1)), np.tile(dy, (BLOCK, 1)), q=q, r=r)
-    return np.asarray(J[0]).ravel()
+        J, P = split_update(J, P, np.tile(dq, (*lead, 1)), np.tile(dy, (*lead, 1)), q=q, r=r)
+    return J.reshape(-1, SIZE)[0]
 
 
 def filterpy_filter(data: list[tuple[np.ndarray, np.ndarray]], *, redraw: bool) -> np.ndarray:
@@ -71,16 +63,6 @@ def filterpy_filter(data: list[tuple[np.ndarray, np.ndarray]], *, redraw: bool) 
     return np.asarray(ukf.x)
 
 
-def best_time(run: Callable[[], np.ndarray], rounds: int) -> float:
-    """Return the shortest time of an update over some rounds, s."""
-    times = []
-    for _ in range(rounds):
-        begin = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - begin)
-    return min(times) / MOTIONS
-
-
 def main() -> None:
     """Compare results and times; exit with 1 when a result differs or the ratio is missed."""
     rounds = 1 if asked_to_be_quick(__doc__) else 7
@@ -91,11 +73,12 @@ def main() -> None:
         return
     data = motions()
     reference = filterpy_filter(data, redraw=True)
-    own = {"sigma points": sigma_points, "split form": split}
-    worst = max(float(np.abs(run(data) - reference).max()) for run in (*own.values(), split_block))
-    times = {"filterpy": best_time(lambda: filterpy_filter(data, redraw=False), rounds)}
-    times |= {name: best_time(partial(run, data), rounds) for name, run in own.items()}
-    times[f"split form, {BLOCK} runs side by side"] = best_time(lambda: split_block(data), rounds) / BLOCK
+    own = {"sigma points": sigma_points, "split form": split, BESIDE: partial(split, lead=(BLOCK,))}
+    worst = max(float(np.abs(run(data) - reference).max()) for run in own.values())
+    calls = {"filterpy": partial(filterpy_filter, data, redraw=False)}
+    calls |= {name: partial(run, data) for name, run in own.items()}
+    measured = times_in_turns(calls, rounds, time.perf_counter)
+    times = {name: min(each) / MOTIONS / (BLOCK if name == BESIDE else 1) for name, each in measured.items()}
     rows = [[name, f"{1e6 * each:.1f} µs", f"{times['filterpy'] / each:.1f}"] for name, each in times.items()]
     print(table(["unscented update of a 3 × 6 Jacobian", "an update", "filterpy / this"], rows))
     print(f"Largest difference of an entry of J after {MOTIONS} motions: {worst:.1e} m/rad.\n")

@@ -66,15 +66,9 @@ class InitialJacobian(ABC, Generic[State]):
         """Return Ĵ₀, (..., m, n), m/rad; only where it is known."""
 
 
-class KnownState(NamedTuple):
-    """Ĵ₀, (..., m, n), m/rad."""
-
-    jacobian: FloatArray
-
-
 @final
-class KnownJacobian(InitialJacobian[KnownState]):
-    """Ĵ₀ = J(q(0)) of a model, which may be constant."""
+class KnownJacobian(InitialJacobian[FloatArray]):
+    """Ĵ₀ = J(q(0)) of a model, which may be constant; the state is Ĵ₀ itself."""
 
     immediate = True
 
@@ -83,7 +77,7 @@ class KnownJacobian(InitialJacobian[KnownState]):
         self._model = model
         self._shape = (spec.m, spec.n)
 
-    def start(self, observation: Observation) -> KnownState:
+    def start(self, observation: Observation) -> FloatArray:
         """Evaluate the model at the start.
 
         Raises:
@@ -92,15 +86,15 @@ class KnownJacobian(InitialJacobian[KnownState]):
         jacobian = np.array(self._model(observation.joint_position), dtype=np.float64, order="C")
         if jacobian.shape[-2:] != self._shape:
             raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}")
-        return KnownState(jacobian)
+        return jacobian
 
-    def step(self, state: KnownState, observation: Observation) -> tuple[KnownState, FloatArray, BoolArray]:
+    def step(self, state: FloatArray, observation: Observation) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return zero: nothing has to move."""
         return state, np.zeros_like(observation.joint_position), np.full(observation.feature.shape[:-1], True)
 
-    def jacobian(self, state: KnownState) -> FloatArray:
+    def jacobian(self, state: FloatArray) -> FloatArray:
         """Return Ĵ₀, (..., m, n), m/rad."""
-        return state.jacobian
+        return state
 
 
 class ProbeState(NamedTuple):

@@ -10,8 +10,13 @@ import casadi
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
-from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
-from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets, move_weights
+from servobench.controllers.laws.mpc.closed_form import (
+    Blocks,
+    bridging_shares,
+    decay_shares,
+    decay_targets,
+    move_weights,
+)
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.units import in_natural_units
@@ -60,7 +65,7 @@ class NmpcCalibrated(Controller):
         min  ½ Σ_τ w_τ ‖y_ref(τ) − β^τ e − h(q_τ) − b‖² + ½ q Σ_τ ‖dq_τ‖²,   q_τ = q̂ + Σ_{s≤τ} dq_s
 
     over speed, acceleration and position limits; e = y_ref(0) − h(q̂) − b, β = exp(−decay Δ). Time τ counts blocks of
-    length Δ (`laws.mpc.blocks`) from `delay` ahead; after it the joints are taken as ideal: q̂ = q + the steps sent in
+    length Δ (`Blocks`) from `delay` ahead; after it the joints are taken as ideal: q̂ = q + the steps sent in
     the last `delay` seconds. b follows the camera, b ← b + γ (y − h(q) − b) with γ = 1 − exp(−disturbance_rate dt);
     with the default γ = 0 the controller ignores the camera and shows the effect of perfect calibration alone. Each
     iteration is a Gauss-Newton step: h is linearised along the present plan, at first the last one shifted by one

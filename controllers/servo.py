@@ -20,8 +20,7 @@ from servobench.controllers.initial_jacobian import InitialJacobian
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish
-from servobench.controllers.stages.pairing import PairState
-from servobench.controllers.stages.prediction import Past, Predictor, shifted
+from servobench.controllers.stages.prediction import Predictor, shifted
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch
@@ -156,8 +155,10 @@ class Servo:
         if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
         predictor, ahead, later = state.predictor, observation, reference
-        if self.predictor is not None:
-            past = self._past(self.predictor, estimation.learned.pair, observation)
+        if self.predictor is not None and self.estimation.pairing is not None:
+            past = self.estimation.pairing.past(
+                estimation.learned.pair, observation.joint_position, self.predictor.window
+            )
             predictor, bound = self.predictor.predict(predictor, J, past, observation)
             ahead = observation.with_values(bound.joint_position, bound.feature)
             later = shifted(reference, bound.lead, self._rows)
@@ -175,14 +176,6 @@ class Servo:
         if self.predictor is not None:
             predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
         return ServoState(estimation, law, state.initial, predictor, state.ready, limited), u
-
-    def _past(self, predictor: Predictor, pair: PairState, observation: Observation) -> Past:
-        pairing = self.estimation.pairing
-        if pairing is None:
-            raise ValueError("a predictor needs the pair stage, which keeps past joint positions")
-        exposed, before = pairing.exposed(pair)
-        window = observation.joint_position - pair.past[..., predictor.window, : self.knowledge.spec.n]
-        return Past(pairing.delay(pair), exposed, before, window)
 
     def _command(
         self, state: ServoState, estimation: EstimationState, ahead: Observation, reference: FloatArray

@@ -8,11 +8,10 @@ With s = 1 nothing is changed. Settings in metres are therefore metres of a ball
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from servobench.controllers.controller import JacobianFunction, RobotKnowledge, SymbolicFeature
+from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
 
 
@@ -40,26 +39,13 @@ def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
     if scale == 1.0:
         return knowledge
     natural = replace(feature, scale=1.0, lower=feature.lower / scale, upper=feature.upper / scale)
+    nominal, true, symbolic = knowledge.nominal_jacobian, knowledge.true_jacobian, knowledge.true_symbolic
     return replace(
         knowledge,
         spec=replace(knowledge.spec, feature=natural),
-        nominal_jacobian=_divided(knowledge.nominal_jacobian, scale),
+        nominal_jacobian=None if nominal is None else NaturalJacobian(nominal, scale),
         nominal_cameras=None if knowledge.nominal_cameras is None else knowledge.nominal_cameras.in_unit(scale),
-        true_jacobian=_divided(knowledge.true_jacobian, scale),
-        true_symbolic=_divided_expression(knowledge.true_symbolic, scale),
+        true_jacobian=None if true is None else NaturalJacobian(true, scale),
+        true_symbolic=None if symbolic is None else lambda q: symbolic(q) / scale,
         unit=scale * knowledge.unit,
     )
-
-
-def _divided(function: JacobianFunction | None, scale: float) -> JacobianFunction | None:
-    return None if function is None else NaturalJacobian(function, scale)
-
-
-def _divided_expression(function: SymbolicFeature | None, scale: float) -> SymbolicFeature | None:
-    if function is None:
-        return None
-
-    def divided(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
-        return function(joint_position) / scale
-
-    return divided

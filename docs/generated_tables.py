@@ -32,12 +32,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import methods_table
 import stored_tables
 from page_studies import STUDIES
+from servobench.controllers.aids import EQUIPPED, AidsConfig
+from servobench.controllers.methods import METHODS, PUBLISHED
+from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.fmus.export import arm_layout
 from servobench.harness.cli.main import command_line
+from servobench.harness.config import registry
 from servobench.harness.config.description import describe_settings, toml
+from servobench.harness.config.settings import flatten
 from servobench.harness.run.metrics import METRICS
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +65,7 @@ def renewed(page: Path) -> str:
         "metrics": lambda _: metrics_table(),
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
-        "methods": lambda part: named_methods(part[3]),
+        "methods": lambda part: presets_table() if part[3] == "presets" else methods_table(),
         "options": lambda _: options_table(),
         "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
         "stored": lambda part: stored_table(part[3], page.parent) or part[4].strip("\n"),
@@ -89,12 +93,58 @@ def options_table() -> str:
     return table(("option", "meaning", "commands"), rows)
 
 
-def named_methods(kind: str) -> str:
-    """Return the table of the named methods, or for the kind "presets" that of their own defaults."""
-    if kind == "presets":
-        rows = [(f"`{name}.{key}`", toml(value)) for name, key, value in methods_table.presets_rows()]
-        return table(methods_table.PRESETS_HEADER, rows)
-    return table(methods_table.METHODS_HEADER, methods_table.methods_rows())
+def methods_table() -> str:
+    """Return the table of the named methods: published ones in the row of their plain name, and those without parts."""
+    rows = []
+    for name in registry.CONTROLLERS:
+        entry = registry.find_controller(name)
+        truth = "yes" if entry.needs_truth else "no"
+        if name not in METHODS:
+            rows.append((f"`{name}`", "–", "–", "–", "none", truth))
+        elif not name.endswith(PUBLISHED):
+            config = entry.config()
+            estimator, law = part_of(config.estimator, ESTIMATORS), part_of(config.law, LAWS)
+            called = f"`{name}`" + (f", `{name}{PUBLISHED}`" if name + PUBLISHED in METHODS else "")
+            networks = trained(ESTIMATORS[estimator], LAWS[law])
+            rows.append((called, f"`{estimator}`", f"`{law}`", aids_in_words(config.aids), networks, truth))
+    return table(("controller", "estimator", "law", "aids", "offline networks", "gets the truth"), rows)
+
+
+def presets_table() -> str:
+    """Return the table of the settings in which a method differs from the defaults of its parts."""
+    rows = [
+        (f"`{name}.{section}.{key}`", toml(value))
+        for name in METHODS
+        for section in ("estimator", "law", "initial")
+        for key, value in differences(getattr(registry.find_controller(name).config(), section)).items()
+    ]
+    return table(("preset", "default"), rows)
+
+
+def differences(config: Any) -> dict[str, Any]:  # noqa: ANN401 - any settings
+    """Return the settings that differ from the defaults of their class."""
+    usual = flatten(type(config)())
+    return {key: value for key, value in flatten(config).items() if value != usual[key]}
+
+
+def part_of(config: Any, parts: dict[str, Part[Any]]) -> str:  # noqa: ANN401 - any settings
+    """Return the name of the part that has these settings."""
+    return next(name for name, part in parts.items() if part.config is type(config))
+
+
+def trained(estimator: Part[Any], law: Part[Any]) -> str:
+    """Return which offline networks a method starts from."""
+    found = [word for word, part in (("Jacobian", estimator), ("controller", law)) if part.trained]
+    return " and ".join(found) or "none"
+
+
+def aids_in_words(aids: AidsConfig) -> str:
+    """Return `none`, `all`, or all with what differs from all."""
+    if not differences(aids):
+        return "none"
+    other = [key for key, value in EQUIPPED.items() if getattr(aids, key) != value]
+    words = (f"`{key}` {getattr(aids, key)}".replace("False", "off") for key in other)
+    return "all" + (f", but {', '.join(words)}" if other else "")
 
 
 def measured_table(name: str, folder: Path) -> str:

@@ -157,7 +157,7 @@ def store(study: Study, folder: Path, into: Path) -> None:
     """Write tables and files of a study."""
     for name, table in study.tables(folder).items():
         stored_tables.write(into / "tables" / f"{name}.csv", stored_tables.Stored(stamp(study, folder), table))
-    for name, content in study.files(folder):
+    for name, content in study.files(folder).items():
         path = into / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)

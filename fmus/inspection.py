@@ -26,43 +26,21 @@ TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
 
 
 @dataclass(frozen=True)
-class VariableInformation:
-    """One variable of the model description."""
-
-    name: str
-    type: str
-    shape: tuple[int, ...]
-    causality: str
-    variability: str
-    unit: str
-    start: str
-    description: str
-
-
-@dataclass(frozen=True)
 class FmuInformation:
-    """Content of a model description.
+    """Content of an FMU.
 
     Attributes:
-        fmi_version: as written.
-        model_name: display name.
-        token: GUID or instantiation token.
-        tool: generation tool.
+        description: the model description, as fmpy reads it.
         interfaces: those of co-simulation, model exchange and scheduled execution that it offers, each with the names
             of its capabilities.
         platforms: folders below binaries/.
         has_sources: whether it holds its C sources.
-        variables: all of them, in order.
     """
 
-    fmi_version: str
-    model_name: str
-    token: str
-    tool: str
+    description: Any
     interfaces: Mapping[str, tuple[str, ...]]
     platforms: tuple[str, ...]
     has_sources: bool
-    variables: tuple[VariableInformation, ...]
 
 
 def read_information(path: Path) -> FmuInformation:
@@ -72,18 +50,9 @@ def read_information(path: Path) -> FmuInformation:
         ValueError: it is not an FMU.
     """
     root = extract_fmu(path)
-    description = parse_description(path, root)
-    binaries = root / "binaries"
-    return FmuInformation(
-        fmi_version=str(description.fmiVersion),
-        model_name=str(description.modelName),
-        token=str(description.guid or description.instantiationToken),
-        tool=str(description.generationTool or "unknown"),
-        interfaces=_interfaces(root),
-        platforms=tuple(sorted(item.name for item in binaries.iterdir())) if binaries.is_dir() else (),
-        has_sources=(root / "sources").is_dir(),
-        variables=tuple(_variable(variable) for variable in description.modelVariables),
-    )
+    description, binaries = parse_description(path, root), root / "binaries"
+    platforms = sorted(item.name for item in binaries.iterdir()) if binaries.is_dir() else ()
+    return FmuInformation(description, _interfaces(root), tuple(platforms), (root / "sources").is_dir())
 
 
 INTERFACES = {
@@ -108,19 +77,11 @@ def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _variable(variable: Any) -> VariableInformation:  # noqa: ANN401 - as above
+def shape_of(variable: Any) -> tuple[int, ...]:  # noqa: ANN401 - fmpy's classes carry no usable types
+    """Return the sizes of the axes of a variable, as they are at its start; an axis of unknown size is left out."""
     axes = variable.dimensions or ()
     sizes = [each.start if each.start is not None else getattr(each.variable, "start", None) for each in axes]
-    return VariableInformation(
-        name=variable.name,
-        type=variable.type,
-        shape=tuple(int(size) for size in sizes if size is not None),
-        causality=variable.causality or "local",
-        variability=variable.variability or "continuous",
-        unit=variable.unit or "",
-        start=str(variable.start or ""),
-        description=variable.description or "",
-    )
+    return tuple(int(size) for size in sizes if size is not None)
 
 
 @dataclass(frozen=True)

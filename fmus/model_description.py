@@ -159,11 +159,6 @@ class Description:
     step: float = 0.05
     exchange: bool = True
 
-    @property
-    def experiment(self) -> dict[str, str]:
-        """The default experiment."""
-        return {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(self.step)}
-
 
 def write_description(description: Description, version: int, token: str) -> bytes:
     """Return modelDescription.xml of FMI 2.0 or 3.0 with its GUID or instantiation token."""
@@ -179,7 +174,8 @@ def write_description(description: Description, version: int, token: str) -> byt
     _interfaces(root, description, version)
     _units(root, {group.unit for group in description.layout.groups})
     _log_categories(root)
-    ET.SubElement(root, "DefaultExperiment", description.experiment)
+    experiment = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(description.step)}
+    ET.SubElement(root, "DefaultExperiment", experiment)
     variables = ET.SubElement(root, "ModelVariables")
     (_scalar_variables if version == 2 else _array_variables)(variables, description)
     structure = ET.SubElement(root, "ModelStructure")

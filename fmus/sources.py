@@ -25,9 +25,8 @@ from servobench.plant.cameras.optics import Optics
 from servobench.plant.cameras.symbolic import (
     SX,
     ArmGeometry,
-    HandEyeGeometry,
     SetupGeometry,
-    feature_and_jacobian,
+    arm_frames,
     features,
     points_in_cameras,
     valid_features,
@@ -84,7 +83,11 @@ def layout_header(
     sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
     zero = np.zeros(1)
     values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
-    minima = [bound for group in settable for bound in [_bound(group.minimum)] * group.size]
+    minima = [
+        "-HUGE_VAL" if group.minimum is None else float(group.minimum).hex()
+        for group in settable
+        for _ in range(group.size)
+    ]
     lines += [f"#define GROUPS {{{sizes}}}"]
     lines += [_initialiser("START_VALUES", [float(value).hex() for value in values])]
     lines += [_initialiser("MINIMA", minima), "#endif", ""]
@@ -95,10 +98,6 @@ def _macro(name: str) -> str:
     return name.upper().replace("DER(", "DER_").replace(")", "")
 
 
-def _bound(minimum: float | None) -> str:
-    return "-HUGE_VAL" if minimum is None else float(minimum).hex()
-
-
 def _initialiser(name: str, values: list[str]) -> str:
     return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"
 
@@ -106,13 +105,13 @@ def _initialiser(name: str, values: list[str]) -> str:
 @cache
 def kinematics_source(layout: ArmLayout) -> str:
     """Return the C source of the kinematic core for the arm that `layout` describes."""
-    return generated_source("kinematics", _core_functions(layout))
+    return generated_source("kinematics", core_functions(layout))
 
 
 def arm_constants(layout: ArmLayout) -> dict[str, int]:
     """Return the sizes and offsets that the model of an arm needs beside those of every layout."""
     first, *_ = layout.computed
-    work = max(function.sz_w() for function in _core_functions(layout))
+    work = max(function.sz_w() for function in core_functions(layout))
     return {
         "N_JOINTS": _size(layout, "joint_position"),
         "N_KINEMATIC": kinematic_size(layout),
@@ -126,7 +125,8 @@ def kinematic_size(layout: ArmLayout) -> int:
     return sum(group.size for group in layout.kinematic)
 
 
-def _core_functions(layout: ArmLayout) -> list[Any]:
+def core_functions(layout: ArmLayout) -> list[Any]:
+    """Return the three functions of the kinematic core of an arm."""
     n = _size(layout, "joint_position")
     q, p = casadi.SX.sym("q", n), casadi.SX.sym("p", kinematic_size(layout))
     dq, dp = casadi.SX.sym("dq", n), casadi.SX.sym("dp", kinematic_size(layout))
@@ -145,14 +145,25 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
     arm, view = _arm(part), layout.view
     if view is None:
-        ball = HandEyeGeometry(arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
-        feature, jacobian = feature_and_jacobian(q, ball)
-        return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
+        return _ball(q, part, arm)
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
     feature = features(points, geometry.optics, view.setup)
     seen = valid_features(points, geometry.optics, view.setup)
     return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
+
+
+def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry) -> tuple[SX, SX]:
+    """Return the ball in the camera frame, always seen, and ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i))."""
+    R_BC = _rotation(part["camera_rpy"])
+    axes, origins, rotation, position = arm_frames(q, arm)
+    ball = position + rotation @ part["tool"]
+    columns = [
+        arm.gear_ratio[i] * casadi.cross(axis, ball - origin)
+        for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
+    ]
+    feature = R_BC.T @ (ball - part["camera_position"])
+    return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), R_BC.T @ casadi.horzcat(*columns)
 
 
 def _arm(part: Mapping[str, SX]) -> ArmGeometry:

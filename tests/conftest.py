@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-WHOLE_FOLDERS = ("closed_loop", "end_to_end")  # whose tests are all slow
+SLOW = {  # folders and files whose tests are all slow
+    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_exit_codes", "test_fmu_model", "test_groups",
+    "test_integrity", "test_outcome",
+}  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
 settings.register_profile("servobench", deadline=None, derandomize=True)
@@ -35,7 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the slow tests first, so that the quick ones fill the end of a run in several processes."""
     for item in items:
-        if item.path.parent.name in WHOLE_FOLDERS:
+        if SLOW & {item.path.parent.name, item.path.stem}:
             item.add_marker("slow")
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
@@ -48,12 +51,12 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Hand a file with a mark `xdist_group` to one process: pytest 9.2 drops what pytest-xdist 3.8 adds to names."""
+    """Hand a file whose tests share a fixture to one process, and all others test by test."""
     from xdist.scheduler import LoadGroupScheduling
 
     @cache
     def is_group(path: str) -> bool:
-        return "mark.xdist_group(" in (config.rootpath / path).read_text(encoding="utf-8")
+        return 'scope="module"' in (config.rootpath / path).read_text(encoding="utf-8")
 
     class ByGroup(LoadGroupScheduling):
         def _split_scope(self, nodeid: str) -> str:
@@ -76,6 +79,12 @@ def _interrupts_arrive():
 def _floating_point_errors_raise():
     with np.errstate(all="raise"):
         yield
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Let commands draw no figures, which takes seconds."""
+    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
 
 
 @pytest.fixture

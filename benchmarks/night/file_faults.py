@@ -33,8 +33,7 @@ import pandas as pd
 
 from kit.command import PACKAGE, judged
 from kit.foreign_fmu import packed
-from kit.toy import plant_spec
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from kit.toy import TRAINING, plant_spec
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.integrity import examine
@@ -55,12 +54,6 @@ SETTINGS = {
     "run": {"lost_after": 0.05},
     "kinematic": {"sensing": {"drop_probability": 0.05}},
 }
-SMALL = TrainingConfig(
-    (0.5, 0.5),
-    (1.5, 1.5),
-    jacobian=JacobianTraining(centres=8, samples=60),
-    controller=ControllerTraining(hidden=4, samples=60),
-)
 
 
 def build(folder: Path) -> Path:
@@ -168,7 +161,7 @@ class Caches:
         if not archive_path.exists():
             archive_path.write_bytes(packed(2, zipfile.ZIP_DEFLATED))
         extract_fmu(archive_path)
-        network_source(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(SMALL)
+        network_source(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(TRAINING)
 
     def outcome(self, point: Path) -> dict[str, bytes]:
         entries = [entry for kind in ("extracted", NETWORKS) for entry in cache.cache_folder(kind).iterdir()]

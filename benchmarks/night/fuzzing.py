@@ -26,7 +26,6 @@ from pathlib import Path
 from types import FrameType
 
 import numpy as np
-from hypothesis import strategies as st
 
 from night.parsers import PARSERS, Parser
 
@@ -42,20 +41,8 @@ class Broken(AssertionError):
     """A parser did not keep its promise."""
 
 
-def inputs(parser: Parser) -> st.SearchStrategy[str | bytes]:
-    """Return changed examples, and inputs that have nothing to do with them."""
-    raw = isinstance(parser.examples[0], bytes)
-    noise = st.binary(max_size=12) if raw else st.text(max_size=12)
-    words = [word.encode("latin-1") if raw else word for word in parser.words]
-    pieces = st.one_of(st.sampled_from(words), noise) if words else noise
-    change = st.tuples(st.sampled_from(CHANGES), st.floats(0.0, 1.0), st.sampled_from(LENGTHS), pieces)
-    changed = st.builds(_change, st.sampled_from(parser.examples), st.lists(change, min_size=1, max_size=4))
-    joined = st.lists(pieces, max_size=6).map(b"".join if raw else "".join)
-    return st.one_of(changed, changed, changed, joined)
-
-
 def drawn(parser: Parser, source: random.Random) -> str | bytes:
-    """Return an input as `inputs` has them, in a hundredth of the time: hypothesis keeps what it needs to shrink it."""
+    """Return a changed example, or an input that has nothing to do with them."""
     raw = isinstance(parser.examples[0], bytes)
     words = [word.encode("latin-1") if raw else word for word in parser.words]
 

@@ -3,7 +3,7 @@
 On its way it is killed twice, meets a full disk once and a second process once; each time it goes on with --resume. At
 the end every run is a row, and those that nothing was done to equal those of a quiet sweep bit for bit.
 
-    PYTHONPATH=benchmarks python -m night.hostile_sweep --runs 10000
+    PYTHONPATH=tests:benchmarks python -m night.hostile_sweep --runs 10000
 
 A quarter of the runs each: the controller `Sometimes`, of which every fourth run does harm, `Falsifies`, which leaves a
 false numpy and a false clock behind, `Quiet`, and `constant` of this package.
@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Final
 
 import pandas as pd
-import psutil
 
+from kit.command import judged, left_behind
 from night import hostile_controllers
 from servobench.plant.contract.seeds import named_seed
 
@@ -88,16 +88,9 @@ class Night:
         parts = sorted((self.folder / name / "parts").glob("[0-9]*.runs.parquet"))
         return int(parts[-1].name.split(".")[0]) if parts else 0
 
-    def left(self) -> list[psutil.Process]:
+    def left(self) -> list[str]:
         """Return the processes of sweeps that still run."""
-        found = []
-        for process in psutil.process_iter():
-            try:
-                if process.environ().get(MARK) == str(self.folder) and process.status() != psutil.STATUS_ZOMBIE:
-                    found.append(process)
-            except psutil.Error:
-                continue
-        return found
+        return left_behind(MARK, str(self.folder))
 
 
 def carry_out(night: Night) -> tuple[float, float, list[float]]:
@@ -135,8 +128,8 @@ def judge(night: Night) -> pd.DataFrame:
         sys.exit(f"{len(hard)} rows instead of {night.runs}, or other ones")
     hard["harm"] = [_harm(*each) for each in zip(hard["controller"], hard["seed"], strict=True)]
     spared = hard["harm"].isin(["", *HARMLESS])
-    compared = [name for name in quiet.columns if not name.startswith(("controller_time", "plant_time"))]
-    pd.testing.assert_frame_equal(hard[spared][compared], quiet[spared][compared], check_exact=True)
+    found, wanted = judged(hard)[spared].drop(columns="harm"), judged(quiet)[spared]
+    pd.testing.assert_frame_equal(found, wanted, check_exact=True)
     if (hard[~spared]["status"] == "completed").any():
         sys.exit(f"runs to which harm was done completed:\n{hard[~spared & (hard['status'] == 'completed')]}")
     return hard.groupby(["harm", "status"]).size().rename("runs").reset_index()

@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[2]
 GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> modules, unit tests
     "kinematics": (
         ("plant/robot/arm.py", "plant/robot/hand_eye.py"),
-        ("plant/test_arm.py", "plant/test_symbolic.py", "plant/test_plant_lanes.py"),
+        ("plant/test_arm.py", "plant/test_plant_lanes.py"),
     ),
     "estimators": (
         ("controllers/estimators/*.py",),
@@ -58,7 +58,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "folders": (
         ("harness/batch/tables.py", "plant/contract/checksums.py", "harness/batch/integrity.py",
          "harness/batch/results.py"),
-        ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
+        ("plant/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),
 }  # fmt: skip
 BROKEN = 77  # exit code of a mutant that could not be put in place

@@ -18,7 +18,7 @@ import numpy as np
 
 from kit.foreign_fmu import describe, describe_exchange, packed
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
-from kit.toy import plant_spec
+from kit.toy import TRAINING, plant_spec
 from night.folder_readers import (
     ENTRY_SUMS,
     HOLDER,
@@ -31,7 +31,6 @@ from night.folder_readers import (
     other_table,
     part_name,
 )
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
 from servobench.fmus.compiler import parse_platforms
@@ -164,12 +163,7 @@ def _forget(*functions) -> None:
 
 @cache
 def _npz() -> bytes:
-    samples = {
-        "jacobian": JacobianTraining(centres=8, samples=60),
-        "controller": ControllerTraining(hidden=4, samples=60),
-    }
-    config = TrainingConfig((0.5, 0.5), (1.5, 1.5), **samples)
-    networks = train(config, lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))
+    networks = train(TRAINING, lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))
     with tempfile.TemporaryDirectory() as folder:
         save_networks(networks, Path(folder) / "networks.npz")
         return (Path(folder) / "networks.npz").read_bytes()

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of
+from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, Update, cholesky_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, outer, transposed
 from servobench.plant.contract.settings import Count, Positive, settings
@@ -31,16 +31,11 @@ MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is practically 0, but c
 MIN_ERROR: Final = 0.1  # [1] smallest |e| of the generalised kernel, in standard deviations
 
 
-class Correction(Protocol):
-    """The formula of one of these filters; see `kalman.Update`, with the walk already added to P (..., m, n, n)."""
+def _by_rows(config: RandomWalk, correction: Update) -> RandomWalkEstimator:
+    """Return the estimator that adds the walk to the covariance of each row, and then corrects.
 
-    def __call__(  # noqa: D102 - of the class
-        self, J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
-    ) -> tuple[FloatArray, FloatArray]: ...
-
-
-def _by_rows(config: RandomWalk, correction: Correction) -> RandomWalkEstimator:
-    """Return the estimator that adds the walk to the covariance of each row, and then corrects."""
+    The correction is called as `kalman.split_update`, with P (..., m, n, n) after the walk and without q.
+    """
 
     def update(
         J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
@@ -56,10 +51,19 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
     return np.exp(-np.minimum(error * error / (2.0 * bandwidth**2), MAX_EXPONENT))
 
 
+def weighted_gain(
+    P: FloatArray, joint_step: FloatArray, weight: FloatArray, r: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return P Δq and the gain K of each row, (..., m, n), for weights of the measurement (..., m) alone."""
+    dq = joint_step[..., None, :]
+    PH = np.matvec(P, dq)
+    return PH, weight[..., None] * PH / (weight * np.vecdot(PH, dq) + r[..., None])[..., None]
+
+
 def corrected(
     J: FloatArray, P: FloatArray, gain: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `Correction`."""
+    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `_by_rows`."""
     dq = joint_step[..., None, :]
     A = P - outer(gain, np.matvec(P, dq))
     P = A + outer(r[..., None, None] * gain - np.matvec(A, dq), gain)
@@ -100,7 +104,7 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `Correction`, as for the others up to `r`.
+        J: J⁻; see `_by_rows`, as for the others up to `r`.
         P: its covariance.
         joint_step: Δq.
         feature_step: Δy.
@@ -158,8 +162,7 @@ def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) 
 
     until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
     """
-    weight = partial(gaussian_weight, bandwidth=config.bandwidth)
-    return _by_fixed_point(config, weight)
+    return _by_fixed_point(config, partial(gaussian_weight, bandwidth=config.bandwidth))
 
 
 @settings
@@ -202,8 +205,7 @@ def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None
     factor |e|^(α−2) has no finite or no positive value at e = 0, where the iteration begins: |e| is taken as at least
     `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
     """
-    weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
-    return _by_fixed_point(config, weight)
+    return _by_fixed_point(config, partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth))
 
 
 @settings
@@ -217,11 +219,10 @@ class ImcckfConfig(RandomWalk):
 def imcckf_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `Correction`."""
+    """Correct by one motion; see `_by_rows`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
-    PH = np.matvec(P, joint_step[..., None, :])
-    gain = weight[..., None] * PH / (weight * np.vecdot(PH, joint_step[..., None, :]) + r[..., None])[..., None]
+    PH, gain = weighted_gain(P, joint_step, weight, r)
     P = P - outer(gain, PH)
     return J + innovation[..., None] * gain, (P + transposed(P)) / 2
 
@@ -258,11 +259,10 @@ def rmckf_update(
     bandwidth: float,
     regularisation: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `Correction`."""
+    """Correct by one motion; see `_by_rows`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(innovation / np.sqrt(r)[..., None], bandwidth) + regularisation
-    PH = np.matvec(P, joint_step[..., None, :])
-    gain = weight[..., None] * PH / (weight * np.vecdot(PH, joint_step[..., None, :]) + r[..., None])[..., None]
+    _, gain = weighted_gain(P, joint_step, weight, r)
     return corrected(J, P, gain, joint_step, feature_step, r=r)
 
 

@@ -11,7 +11,8 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Protocol, TypeAlias, final
+from collections.abc import Callable
+from typing import Literal, NamedTuple, TypeAlias, final
 
 import numpy as np
 
@@ -136,33 +137,9 @@ def full_covariances(J: FloatArray, q: FloatArray, r: FloatArray) -> dict[str, F
     return {"Q": q[..., None, None] * np.eye(m * n), "R": r[..., None, None] * np.eye(m)}
 
 
-class Update(Protocol):
-    """The formula by which a filter corrects the Jacobian and its covariance.
-
-    Args:
-        J: Ĵ before the motion, (..., m, n), m/rad.
-        P: its covariance, (m/rad)²; its shape depends on the filter.
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        q: variance of the walk during the motion, (...), (m/rad)².
-        r: variance of each component of Δy, (...), m².
-
-    Returns:
-        Ĵ and P after the motion.
-    """
-
-    def __call__(  # noqa: D102 - of the class
-        self,
-        J: FloatArray,
-        P: FloatArray,
-        joint_step: FloatArray,
-        feature_step: FloatArray,
-        *,
-        q: FloatArray,
-        r: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]: ...
-
-
+Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
+"""The formula by which a filter corrects the Jacobian and its covariance, called as `split_update`; the shape of P
+depends on the filter, see `Covariance`."""
 Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
 """One P, (n, n), that all rows of J share; one of each row, (m, n, n); or one of all entries, (mn, mn)."""
 

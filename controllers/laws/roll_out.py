@@ -107,11 +107,7 @@ def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
 
 def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float) -> FloatArray:
     """Return α = k Σ‖e(k+t)‖² / (ε + ‖G‖²_F), (...), (eq. 23 with ε); 0 where there is nothing to descend."""
-    return step_size(k * sum_of_squares(ahead.errors, 2), epsilon + sum_of_squares(direction, 3))
-
-
-def step_size(wanted: FloatArray, size: FloatArray) -> FloatArray:
-    """Return wanted / size, (...), and 0 where the size is 0."""
+    wanted, size = k * sum_of_squares(ahead.errors, 2), epsilon + sum_of_squares(direction, 3)
     quotient: FloatArray = wanted * (size > 0.0) / (size + (size == 0.0))
     return quotient
 

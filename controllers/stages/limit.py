@@ -37,8 +37,7 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     Returns:
         (..., n), rad/s.
     """
-    excess = np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1, keepdims=True)
-    return np.asarray(joint_velocity / np.maximum(excess, 1.0))
+    return np.asarray(joint_velocity / np.maximum(largest_excess(joint_velocity, limit), 1.0)[..., None])
 
 
 class _Shared(NamedTuple):

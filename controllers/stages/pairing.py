@@ -146,6 +146,22 @@ class Paired(NamedTuple):
     rates: FloatArray
 
 
+class Past(NamedTuple):
+    """The past motion that the predict stage needs.
+
+    Attributes:
+        delay: d, (...), periods.
+        exposed: q(k−d), (..., n), rad.
+        before: q(k−d) − q(k−d−1), (..., n), rad.
+        window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+    """
+
+    delay: FloatArray
+    exposed: FloatArray
+    before: FloatArray
+    window: FloatArray
+
+
 @final
 class Pairing:
     """Identifies delay, map and noise, each if its aid is on, and pairs motions by the delay.
@@ -218,10 +234,12 @@ class Pairing:
         """Return d, (...), periods."""
         return np.asarray(np.take(self.delays, state.candidate))[()]
 
-    def exposed(self, state: PairState) -> tuple[FloatArray, FloatArray]:
-        """Return q(k−d) and q(k−d) − q(k−d−1), (..., n), rad."""
-        rows = self._candidates.exposed(state.past[..., : self._n], state.candidate)
-        return rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
+    def past(self, state: PairState, joint_position: FloatArray, window: int) -> Past:
+        """Return the past of an arm that is at `joint_position` (..., n), rad; `window` in periods."""
+        positions = state.past[..., : self._n]
+        rows = self._candidates.exposed(positions, state.candidate)
+        before = rows[..., 0, :] - rows[..., 1, :]
+        return Past(self.delay(state), rows[..., 0, :], before, joint_position - positions[..., window, :])
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""

@@ -30,6 +30,7 @@ from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
+from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -104,22 +105,6 @@ class Prediction(NamedTuple):
     feature: FloatArray
     joint_position: FloatArray
     lead: FloatArray
-
-
-class Past(NamedTuple):
-    """The past motion that the predict stage needs.
-
-    Attributes:
-        delay: d, (...), periods.
-        exposed: q(k−d), (..., n), rad.
-        before: q(k−d) − q(k−d−1), (..., n), rad.
-        window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
-    """
-
-    delay: FloatArray
-    exposed: FloatArray
-    before: FloatArray
-    window: FloatArray
 
 
 class PredictorState(NamedTuple):

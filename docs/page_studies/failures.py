@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from page_studies.methods import SIX, by_method, quoted, settled
-from page_studies.study import Study, Words, sweep
+from page_studies.cells import by_method, ended_early, quoted, rows_by_method, settled
+from page_studies.study import SIX, Study, Words, settings, sweep
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
@@ -36,13 +37,11 @@ CAUSES = {
     "jacobian_condition_max": "largest condition number",
     "steady_state_error": "error in the last second [m]",
 }
-
-
 FAILED = "of the failed runs settle"
 RUNS = "runs"  # the part of which failures are repeated
 CHANGES = {
-    "with 20 s": ("--set", "random.duration=20"),
-    "with 60 s": ("--set", "random.duration=60"),
+    "with 20 s": settings(["random.duration=20"]),
+    "with 60 s": settings(["random.duration=60"]),
     "without noise": ("--noise", "0"),
     "at 40 Hz": ("--period", "0.025"),
 }
@@ -50,19 +49,31 @@ CHANGES = {
 
 def tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the rates of failure, what failed runs have in common, and how many settle with one thing changed."""
-    runs = judged(load_runs(folder / RUNS))
+    runs = load_runs(folder / RUNS)
+    runs = runs.assign(failed=settling_times(runs).isna()).merge(robots(runs.drop_duplicates("seed")), on="seed")
+    causes = {title: partial(cause_of_failure, cause=cause) for cause, title in CAUSES.items()}
+    again = {title: load_runs(folder / part_of(title)) for title in CHANGES} if runs["failed"].any() else {}
+    changed = []
+    for method, own in by_method(runs):
+        seeds = set(own.loc[own["failed"], "seed"])
+        repeats = {
+            title: each[(each["controller"] == method) & each["seed"].isin(seeds)] for title, each in again.items()
+        }
+        if seeds:
+            counts = {title: str(settled(each)) for title, each in repeats.items()}
+            changed.append({FAILED: f"{quoted(method)}, of {len(seeds)}"} | counts)
     return {
-        "failures": pd.DataFrame(rate_rows(runs)),
-        "failure_causes": pd.DataFrame(cause_rows(runs)),
-        "failures_changed": pd.DataFrame(changed_rows(runs, folder), columns=[FAILED, *CHANGES]),
+        "failures": pd.DataFrame(rows_by_method(runs, RATES)),
+        "failure_causes": pd.DataFrame(rows_by_method(runs, causes)),
+        "failures_changed": pd.DataFrame(changed, columns=[FAILED, *CHANGES]),
     }
 
 
-def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield the picture of the errors at the end."""
+def pictures(folder: Path) -> dict[str, bytes]:
+    """Return the picture of the errors at the end."""
     stream = io.BytesIO()
     exceedance(load_runs(folder / RUNS)).savefig(stream, format="png", dpi=110)
-    yield "pictures/final_errors.png", stream.getvalue()
+    return {"pictures/final_errors.png": stream.getvalue()}
 
 
 def repeated(options: Words) -> Callable[[Path], Words]:
@@ -74,13 +85,6 @@ def repeated(options: Words) -> Callable[[Path], Words]:
         return sweep("kinematic", SIX, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
 
     return command
-
-
-def judged(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the runs with whether they failed, and with what that may depend on."""
-    drawn = robots(runs.drop_duplicates("seed"))
-    runs = runs.assign(failed=settling_times(runs).isna())
-    return runs.merge(drawn, on="seed")
 
 
 def robots(runs: pd.DataFrame) -> pd.DataFrame:
@@ -97,47 +101,23 @@ def robots(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance"])
 
 
-def rate_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield the rows of the table of failure rates with 95 % Wilson intervals."""
-    for method, own in by_method(runs):
-        early = own["status"] != COMPLETED
-        kinds = ", ".join(f"{count} {kind}" for kind, count in own.loc[early, "status"].value_counts().items())
-        yield {
-            "method": quoted(method),
-            "runs": f"{len(own):,}",
-            "periods": f"{own['periods'].sum():,}",
-            "ended early": kinds or "0",
-            "not settled": f"{(own['failed'] & ~early).sum():,}",
-            "failure rate [95 % interval]": f"{success_rate(int(own['failed'].sum()), len(own)):.1e}",
-        }
+RATES = {
+    "runs": lambda runs: f"{len(runs):,}",
+    "periods": lambda runs: f"{runs['periods'].sum():,}",
+    "ended early": lambda runs: ended_early(runs) or "0",
+    "not settled": lambda runs: f"{(runs['failed'] & (runs['status'] == COMPLETED)).sum():,}",
+    "failure rate [95 % interval]": lambda runs: f"{success_rate(int(runs['failed'].sum()), len(runs)):.1e}",
+}  # with the 95 % Wilson interval
 
 
-def cause_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield the rows of the table of causes: medians of failed and other runs, and the rank statistic."""
-    for method, own in by_method(runs):
-        failed = own["failed"].to_numpy()
-        row = {"method": quoted(method)}
-        for cause, title in CAUSES.items():
-            values, count = own[cause].to_numpy(), failed.sum()
-            if failed.all() or not failed.any():
-                row[title] = "none failed" if not count else "all failed"
-                continue
-            larger = (rankdata(values)[failed].sum() - count * (count + 1) / 2) / (count * (~failed).sum())
-            row[title] = f"{np.median(values[failed]):.3g} / {np.median(values[~failed]):.3g} ({larger:.2f})"
-        yield row
-
-
-def changed_rows(runs: pd.DataFrame, folder: Path) -> Iterator[dict[str, str]]:
-    """Yield for each method how many of its failed runs settle with one thing changed."""
-    for method, own in by_method(runs):
-        seeds = set(own.loc[own["failed"], "seed"])
-        if seeds:
-            row = {FAILED: f"{quoted(method)}, of {len(seeds)}"}
-            for title in CHANGES:
-                again = load_runs(folder / part_of(title))
-                chosen = (again["controller"] == method) & again["seed"].isin(seeds)
-                row[title] = str(settled(again[chosen]))
-            yield row
+def cause_of_failure(runs: pd.DataFrame, cause: str) -> str:
+    """Return the medians of failed and of other runs of a method, and the rank statistic."""
+    failed, values = runs["failed"].to_numpy(), runs[cause].to_numpy()
+    count = failed.sum()
+    if failed.all() or not count:
+        return "all failed" if count else "none failed"
+    larger = (rankdata(values)[failed].sum() - count * (count + 1) / 2) / (count * (~failed).sum())
+    return f"{np.median(values[failed]):.3g} / {np.median(values[~failed]):.3g} ({larger:.2f})"
 
 
 def part_of(title: str) -> str:

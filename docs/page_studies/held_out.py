@@ -1,4 +1,4 @@
-"""1,000 robots on which nothing was tuned: every method best equipped and as published, and what tuning leaves open."""
+"""Robots on which nothing was tuned: every method best equipped and as published, tuning studies, and one aid less."""
 
 from __future__ import annotations
 
@@ -10,47 +10,94 @@ from typing import Any, Final
 
 import pandas as pd
 
-from page_studies.methods import (
+from page_studies import cells
+from page_studies.study import (
     BETTER,
     BOTH,
-    MOVE,
+    ENGINES,
     PUBLISHED,
+    RENDERED,
     SIX,
     SUFFIX,
-    by_method,
-    difference,
-    division,
-    millimetres,
-    overshoot,
-    paired,
-    quoted,
-    settling,
-    share,
-    worst_errors,
+    Study,
+    Words,
+    on_engines,
+    settings,
+    sweep,
 )
-from page_studies.side_by_side import ENGINES, bare, differences, on_engines
-from page_studies.study import Study, Words, sweep
+from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.batch.results import load_runs
-from servobench.harness.config.defaults import tuned_file
+from servobench.harness.config.registry import find_controller
+from servobench.harness.config.settings import default_config, tuned_file
 
-LOST: Final = 1.0  # [m] that a circle counts as which was not completed
-STUDIES: Final = 3  # that a file of tuned values holds
-RENDERED: Final = (*SIX, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in SIX))
+Cell = Callable[[pd.DataFrame], str]
+PAIRS: Final = [(BETTER, name) for name in BOTH if name != BETTER] + [
+    (name.removesuffix(SUFFIX), name) for name in PUBLISHED
+]
+"""The better method with each other one, and each method best equipped with itself as published."""
+TITLES: Final = tuple(f"tuning study {k + 1}: settling time, s" for k in range(3))  # a file of tuned values has three
+USUAL: Final = "all"
+LESS: Final[Mapping[str, Any]] = {aid: getattr(AidsConfig(), aid) for aid in SWITCHES}
+"""The value of each aid that leaves it out."""
+
+
+def of(measure: cells.Measure, cell: Cell) -> Cell:
+    """Return a cell of the runs of one task."""
+    return lambda runs: cell(runs[runs["task"] == measure.task])
+
+
+METHOD_CELLS: Final[Mapping[str, Cell]] = {
+    "division": lambda runs: "as published" if runs["controller"].iloc[0].endswith(SUFFIX) else "best equipped",
+    "settled, %": of(cells.MOVES, cells.share),
+    "settling time, s": of(cells.MOVES, cells.settling),
+    "overshoot, %": of(cells.MOVES, cells.overshoot),
+    "worst 5 % of final errors, mm": of(cells.MOVES, cells.worst_errors),
+    "circle, RMS of the second lap, mm": of(cells.CIRCLES, cells.millimetres),
+}
+HEADLINE_CELLS: Final[Mapping[str, Cell]] = {
+    "settled, %": METHOD_CELLS["settled, %"],
+    "settling, s": METHOD_CELLS["settling time, s"],
+    "circle, mm": METHOD_CELLS["circle, RMS of the second lap, mm"],
+}
+
+
+def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """Yield a row for each method from its moves and circles."""
+    for row in cells.rows_by_method(runs, METHOD_CELLS):
+        yield row | {"method": row["method"].replace(SUFFIX, "")}
+
+
+def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """Yield a row for the better method and each of the paper's, both divisions beside each other."""
+    for name in SIX:
+        row = {"method": cells.quoted(name)}
+        for full, words in ((name, ""), (name + SUFFIX, "as published: ")):
+            own = runs[runs["controller"] == full]
+            row |= {words + title: cell(own) if len(own) else MISSING for title, cell in HEADLINE_CELLS.items()}
+        yield row
 
 
 def tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the headline, all methods, and their paired differences."""
     both = pd.concat([load_runs(folder / part) for part in HELD_OUT.commands], ignore_index=True)
+    pair_rows = [
+        {
+            "pair": f"{cells.quoted(move.first)} − {cells.quoted(move.second)}",
+            "settling time, s": cells.MOVES.difference(move),
+            "circle, mm": cells.CIRCLES.difference(circle),
+        }
+        for move, circle in zip(*(each.compare(both, PAIRS) for each in (cells.MOVES, cells.CIRCLES)), strict=True)
+    ]
     return {
         "headline": pd.DataFrame(headline_rows(both)),
         "held_out": pd.DataFrame(method_rows(both)),
-        "held_out_pairs": pd.DataFrame(pair_rows(both)),
+        "held_out_pairs": pd.DataFrame(pair_rows),
     }
 
 
 def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the same of all methods on rendered images, and the differences between methods, on both engines."""
+    """Return all methods on rendered images, and the better one against each other, on both engines."""
     runs = {engine: load_runs(folder / engine) for engine in ENGINES}
     rows = zip(*(method_rows(runs[engine]) for engine in ENGINES), strict=True)
     beside = [
@@ -58,99 +105,27 @@ def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
         for both in rows
         for engine, row in zip(ENGINES, both, strict=True)
     ]
-    return {"held_out_rendered": pd.DataFrame(beside), "held_out_engines": pd.DataFrame(engine_rows(runs))}
-
-
-def engine_rows(runs: Mapping[str, pd.DataFrame]) -> Iterator[dict[str, str]]:
-    """Yield the better method against each other one on both engines, what holds on one only in bold."""
-    pairs = [pair for pair in method_pairs() if set(pair) <= set(RENDERED)]
-    moves, circles = (
-        differences(
-            {engine: own[own["task"] == task] for engine, own in runs.items()},
-            pairs, metric=metric, never=never, digits=digits, factor=factor,
+    pairs = [pair for pair in PAIRS if set(pair) <= set(RENDERED)]
+    differences = [
+        {"pair": f"{cells.quoted(first)} − {cells.quoted(second)}"}
+        | {f"settling time on `{engine}`, s": move[engine] for engine in ENGINES}
+        | {f"circle on `{engine}`, mm": circle[engine] for engine in ENGINES}
+        for (first, second), move, circle in zip(
+            pairs, cells.MOVES.on_engines(runs, pairs), cells.CIRCLES.on_engines(runs, pairs), strict=True
         )
-        for task, metric, never, digits, factor in (
-            ("random", "settling_time_s", MOVE, 2, 1.0),
-            ("circle", "rms_error_evaluated", LOST, 1, 1e3),
-        )
-    )  # fmt: skip
-    for (first, second), move, circle in zip(pairs, moves, circles, strict=True):
-        row = {"pair": f"{quoted(first)} − {quoted(second)}"}
-        row |= {f"settling time on `{engine}`, s": move[engine] for engine in ENGINES}
-        yield row | {f"circle on `{engine}`, mm": circle[engine] for engine in ENGINES}
+    ]
+    return {"held_out_rendered": pd.DataFrame(beside), "held_out_engines": pd.DataFrame(differences)}
 
 
-def studies_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return how much the three tuning studies differ."""
-    return {"held_out_studies": pd.DataFrame(study_rows(folder), columns=["method", *map(title, range(STUDIES))])}
-
-
-def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield a row for each method from its moves and circles."""
-    for name, own in by_method(runs):
-        move, circle = (own[own["task"] == task] for task in ("random", "circle"))
-        yield {
-            "method": quoted(name.removesuffix(SUFFIX)),
-            "division": division(name),
-            "settled, %": share(move),
-            "settling time, s": settling(move),
-            "overshoot, %": overshoot(move),
-            "worst 5 % of final errors, mm": worst_errors(move),
-            "circle, RMS of the second lap, mm": millimetres(circle),
-        }
-
-
-def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield a row for the better method and each of the paper's, both divisions beside each other."""
-    for name in SIX:
-        row = {"method": quoted(name)}
-        for full in (name, name + SUFFIX):
-            own = runs[runs["controller"] == full]
-            move, circle = (own[own["task"] == task] for task in ("random", "circle"))
-            cells = (share(move), settling(move), millimetres(circle)) if len(own) else (MISSING,) * 3
-            words = "" if full == name else "as published: "
-            row |= dict(zip([f"{words}settled, %", f"{words}settling, s", f"{words}circle, mm"], cells, strict=True))
-        yield row
-
-
-def pair_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """Yield the better method against each other one, and each method best equipped against itself as published."""
-    pairs = method_pairs()
-    moves, circles = (
-        paired(runs[runs["task"] == task], pairs, metric=metric, never=never)
-        for task, metric, never in (("random", "settling_time_s", MOVE), ("circle", "rms_error_evaluated", LOST))
-    )
-    for move, circle in zip(moves, circles, strict=True):
-        yield {
-            "pair": f"{quoted(move.first)} − {quoted(move.second)}",
-            "settling time, s": difference(move),
-            "circle, mm": difference(circle, 1, 1e3),
-        }
-
-
-def method_pairs() -> list[tuple[str, str]]:
-    """Return the better method with each other one, and each method best equipped with itself as published."""
-    pairs = [(BETTER, name) for name in BOTH if name != BETTER]
-    return pairs + [(name.removesuffix(SUFFIX), name) for name in PUBLISHED]
-
-
-def study_rows(folder: Path) -> Iterator[dict[str, str]]:
-    """Yield for each method its median settling time with the values of each of its tuning studies."""
-    parts = [load_runs(folder / part_of(k)) for k in range(STUDIES) if (folder / part_of(k)).exists()]
+def study_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the median settling time of each method with the values of each of its tuning studies."""
+    parts = [load_runs(folder / part) for part in TUNING_STUDIES.commands if (folder / part).exists()]
+    rows = []
     for name in BOTH:
         own = [part[part["controller"] == name] for part in parts]
         if any(len(each) for each in own):
-            yield {"method": quoted(name)} | {title(k): settling(each) for k, each in enumerate(own)}
-
-
-def title(k: int) -> str:
-    """Return the heading of a tuning study."""
-    return f"tuning study {k + 1}: settling time, s"
-
-
-def part_of(k: int) -> str:
-    """Return the part with the values of a tuning study."""
-    return f"study_{k + 1}"
+            rows.append({"method": cells.quoted(name)} | dict(zip(TITLES, map(cells.settling, own), strict=False)))
+    return {"held_out_studies": pd.DataFrame(rows, columns=["method", *TITLES])}
 
 
 def with_values_of_study(k: int) -> Callable[[Path], Words]:
@@ -163,19 +138,48 @@ def with_values_of_study(k: int) -> Callable[[Path], Words]:
             studies = tomllib.loads(file.read_text(encoding="utf-8")).get("studies", []) if file.is_file() else []
             if len(studies) > k:
                 values[name] = studies[k]["settings"]
-        options = [word for name, own in values.items() for each in assignments(name, own) for word in ("--set", each)]
-        return sweep("fmu", values, "random", "40000:40200", *options) if values else ()
+        assignments = [each for name, own in values.items() for each in assigned(name, own)]
+        return sweep("fmu", values, "random", "40000:40200", *settings(assignments)) if values else ()
 
     return command
 
 
-def assignments(section: str, values: Mapping[str, Any]) -> Iterator[str]:
+def assigned(section: str, values: Mapping[str, Any]) -> Iterator[str]:
     """Yield nested settings as `section.key=value`."""
     for key, value in values.items():
         if isinstance(value, Mapping):
-            yield from assignments(f"{section}.{key}", value)
+            yield from assigned(f"{section}.{key}", value)
         else:
             yield f"{section}.{key}={json.dumps(value)}"
+
+
+def without(aid: str | None) -> Words:
+    """Return the sweep of all methods that have an aid, without it; of all methods as they are for None."""
+    names = [
+        name for name in SIX if aid is None or getattr(default_config(find_controller(name)).aids, aid) != LESS[aid]
+    ]
+    less = [f"{name}.aids.{aid}={str(LESS[aid]).lower()}" for name in names if aid]
+    return sweep("fmu", names, "random,circle", "48000:48100", "--latency", "0.05", *settings(less))
+
+
+def aids_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the paired difference that leaving out each aid makes to each method, in moves and on the circle."""
+    usual = load_runs(folder / USUAL)
+    rows: dict[str, list[dict[str, str]]] = {"aids": [], "aids_circle": []}
+    for aid in LESS:
+        changed = load_runs(folder / aid)
+        both = {name: cells.changed_and_usual(changed, usual, name) for name in SIX}
+        for table, measure in zip(rows.values(), (cells.MOVES, cells.CIRCLES), strict=True):
+            table.append(
+                {"left out": cells.quoted(aid)}
+                | {
+                    cells.quoted(name): measure.difference(measure.compare(own, [cells.CHANGED])[0])
+                    if cells.CHANGED[0] in set(own["controller"])
+                    else "not in use"
+                    for name, own in both.items()
+                }
+            )
+    return {name: pd.DataFrame(own) for name, own in rows.items()}
 
 
 HELD_OUT = Study(
@@ -189,13 +193,20 @@ RENDERED_STUDY = Study(
     "rendered",
     "36 held-out robots on rendered images, on both physics engines",
     30,
-    on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040", *bare(plant))),
+    on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040")),
     rendered_tables,
 )
 TUNING_STUDIES = Study(
     "tuning",
     "200 held-out robots with the values of each of the three tuning studies",
     10,
-    {part_of(k): with_values_of_study(k) for k in range(STUDIES)},
-    studies_table,
+    {f"study_{k + 1}": with_values_of_study(k) for k in range(len(TITLES))},
+    study_tables,
+)
+AIDS = Study(
+    "aids",
+    "what each aid carries: best equipped methods with one aid less, 100 robots with a camera 50 ms late",
+    6,
+    {USUAL: without(None)} | {aid: without(aid) for aid in LESS},
+    aids_tables,
 )

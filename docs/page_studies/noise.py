@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,21 +25,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from page_studies.study import Study, Words, sweep
+from page_studies.study import Study, Words, settings, sweep
 from servobench.harness.batch.results import load_runs
-from servobench.harness.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    TEXT,
-    VERMILION,
-    WIDTH,
-    figure_style,
-)
+from servobench.harness.pictures import style
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import find_robot
@@ -47,8 +35,8 @@ from servobench.plant.robot.catalogue import find_robot
 LAW: Final = "pid"
 REFERENCE: Final = "true"
 ESTIMATORS: Final = {
-    "kalman": BLUE, "mckf": ORANGE, "imcckf": SKY, "gmckf": PURPLE, "rmckf": GREEN, "robust": VERMILION,
-    "constant": GREY, REFERENCE: BLACK,
+    "kalman": style.BLUE, "mckf": style.ORANGE, "imcckf": style.SKY, "gmckf": style.PURPLE, "rmckf": style.GREEN,
+    "robust": style.VERMILION, "constant": style.GREY, REFERENCE: style.BLACK,
 }  # fmt: skip
 """Those that are compared, with their colours: the Kalman filter, the correntropy filters, and two bounds."""
 GAIN: Final = 0.2  # [1/s]
@@ -64,10 +52,6 @@ TITLES: Final = {
     "bimodal": "share of the noise that is displaced to either side [%]",
     "stable": "exponent α of stable noise",
 }
-SINGLE: Final = "white and uniform noise"
-PURPOSE: Final = (
-    "filters of the Jacobian under noise of five families, 100 episodes a level, as Leite and others did it"
-)
 GROUP: Final = 0.84  # width of the boxes of a level
 
 
@@ -122,13 +106,15 @@ def family_sweep(setup: SetUp, family: str) -> Words:
     """Return the sweep of one family of noise over its levels."""
     names = [f"{LAW}+{estimator}" for estimator in ESTIMATORS]
     size = DEVIATIONS.get(family, 1.0) * setup.pixel
-    sensing = {"noise": f'"{family}"', "feature_noise": f"{size:.6g}",
-               "noise_offset": f"{DISPLACED * setup.pixel:g}"}  # fmt: skip
-    changes = [f"random.duration={DURATION:g}", *(f"kinematic.sensing.{key}={value}" for key, value in sensing.items())]
-    changes += [f"{name}.law.proportional_gain={GAIN:g}" for name in names]
-    words = [word for change in changes for word in ("--set", change)]
+    changes = [
+        f"random.duration={DURATION:g}",
+        f'kinematic.sensing.noise="{family}"',
+        f"kinematic.sensing.feature_noise={size:.6g}",
+        f"kinematic.sensing.noise_offset={DISPLACED * setup.pixel:g}",
+        *(f"{name}.law.proportional_gain={GAIN:g}" for name in names),
+    ]
     vary = ("--vary", f"{family}={LEVELS[family]}") if LEVELS[family] else ()
-    return sweep("kinematic", names, "random", SEEDS, "--mismatch", "none", *vary, *words, *setup.options)
+    return sweep("kinematic", names, "random", SEEDS, "--mismatch", "none", *vary, *settings(changes), *setup.options)
 
 
 def ratios(folder: Path) -> dict[str, pd.DataFrame]:
@@ -139,10 +125,8 @@ def ratios(folder: Path) -> dict[str, pd.DataFrame]:
         runs["estimator"] = runs["controller"].str.removeprefix(f"{LAW}+")
         runs["level"] = runs["magnitude"].fillna(0.0)
         best = runs[runs["estimator"] == REFERENCE].set_index(["level", "seed"])["rms_error"]
-        ended = runs["status"] != COMPLETED
-        runs["ratio"] = runs["rms_error"] / best.loc[list(zip(runs["level"], runs["seed"], strict=True))].to_numpy()
-        runs.loc[ended, "ratio"] = math.inf
-        found[family] = runs
+        ratio = runs["rms_error"] / best.loc[list(zip(runs["level"], runs["seed"], strict=True))].to_numpy()
+        found[family] = runs.assign(ratio=ratio.where(runs["status"] == COMPLETED, math.inf))
     return found
 
 
@@ -165,22 +149,21 @@ def spread(values: pd.Series) -> str:
     return f"{median:.2f} ({high:.2f})".replace("inf", "∞")
 
 
-def pictures(setup: SetUp, folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield the box plots."""
+def pictures(setup: SetUp, folder: Path) -> dict[str, bytes]:
+    """Return the box plots."""
     stream = io.BytesIO()
     boxes(ratios(folder)).savefig(stream, format="png", dpi=140)
-    yield f"pictures/{setup.study}.png", stream.getvalue()
+    return {f"pictures/{setup.study}.png": stream.getvalue()}
 
 
 def boxes(runs: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw box plots over the levels of each family, a colour an estimator: the error, and that of the Jacobian."""
     shown = {name: colour for name, colour in ESTIMATORS.items() if name != REFERENCE}
-    rows: dict[str, dict[str, pd.DataFrame]] = {
+    rows = {
         title: {f"{level:g}": own for level, own in runs[family].groupby("level")} for family, title in TITLES.items()
-    }
-    rows[SINGLE] = {family: runs[family] for family in ("white", "uniform")}
-    with figure_style(TEXT):
-        figure = Figure(figsize=(WIDTH, 8.0), layout="constrained")
+    } | {"white and uniform noise": {family: runs[family] for family in ("white", "uniform")}}
+    with style.figure_style(style.TEXT):
+        figure = Figure(figsize=(style.WIDTH, 8.0), layout="constrained")
         grid = figure.subplots(len(rows), len(MEASURES), sharey="col")
         for panels, (title, groups) in zip(grid, rows.items(), strict=True):
             for axes, measure in zip(panels, MEASURES, strict=True):
@@ -213,7 +196,8 @@ def draw_groups(axes: Axes, groups: Mapping[str, pd.DataFrame], shown: Mapping[s
 NOISE_STUDIES: Final = tuple(
     Study(
         setup.study,
-        f"{PURPOSE}{setup.where}",
+        "filters of the Jacobian under noise of five families, 100 episodes a level, as Leite and others did it"
+        + setup.where,
         1,
         {family: family_sweep(setup, family) for family in LEVELS},
         partial(tables, setup),

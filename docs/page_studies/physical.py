@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -10,30 +11,17 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from page_studies.held_out import LOST, RENDERED
-from page_studies.methods import (
-    BOTH,
-    MOVE,
-    by_method,
-    count_and_median,
-    difference,
-    millimetres,
-    paired,
-    quoted,
-    settling,
-    short,
-)
-from page_studies.side_by_side import ENGINES, bare, differences, marked, most, on_engines
-from page_studies.study import Study, sweep
-from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
-from servobench.harness.analysis.statistics import median_with_interval
+from page_studies import cells
+from page_studies.study import BOTH, ENGINES, RENDERED, Study, Words, on_engines, settings, sweep
+from servobench.harness.analysis.comparison import column_of, settling_times
+from servobench.harness.analysis.statistics import MISSING, median_with_interval
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.result import COMPLETED
 
 RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
 NOWHERE: Final = "nowhere"
 PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)
-SHORT: Final = ("--set", "random.duration=5")  # [s]; a bullet run costs seconds, and methods settle within three
+SHORT: Final = settings(["random.duration=5"])  # [s]; a bullet run costs seconds, and methods settle within three
 CURVES: Final = ("circle", "lemniscate")
 
 
@@ -46,17 +34,23 @@ def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame(rows)
     for _, own in table[table["plant"].isin(ENGINES)].groupby("method"):
         if len({worse != NOWHERE for worse in own["worse"]}) > 1:
-            table.loc[own.index, "worse"] = own["worse"].map(marked)
+            table.loc[own.index, "worse"] = own["worse"].map(cells.marked)
     return {"rates": table}
 
 
 def rate_rows(runs: pd.DataFrame, plant: str) -> Iterator[dict[str, str]]:
     """Yield a row for each method on one plant."""
-    for name, own in by_method(runs):
+    for name, own in cells.by_method(runs):
         at = {rate: own[np.isclose(own["period_s"], 1.0 / rate)] for rate in RATES}
         worse = [f"{fast} Hz: {words}" for slow, fast in pairwise(RATES) if (words := loss(at[slow], at[fast]))]
-        cells = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
-        yield {"method": quoted(name), "plant": plant} | cells | {"worse": "; ".join(worse) or NOWHERE}
+        found = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
+        yield {"method": cells.quoted(name), "plant": plant} | found | {"worse": "; ".join(worse) or NOWHERE}
+
+
+def count_and_median(runs: pd.DataFrame) -> str:
+    """Return how many runs settled and their median settling time [s], as in `40, 0.83`."""
+    count, middle = cells.settled(runs), median_with_interval(settling_times(runs)).value
+    return f"{count}, {middle:.2f}" if middle < float("inf") else f"{count}, {MISSING}" if count else "0"
 
 
 def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
@@ -68,52 +62,47 @@ def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
     settles = [set(runs.loc[settling_times(runs).notna(), "seed"]) for runs in (slow, fast)]
     lost, won = len(settles[0] - settles[1]), len(settles[1] - settles[0])
     words = []
-    if most(lost, won):
+    if cells.most(lost, won):
         words.append(f"{lost} fewer settle, {won} more")
     named = pd.concat([slow.assign(controller="slow"), fast.assign(controller="fast")])
-    later = paired(named, [("fast", "slow")], never=MOVE)[0]
+    later = cells.MOVES.compare(named, [("fast", "slow")])[0]
     if later.difference.low > 0.0:
-        words.append(f"{difference(later)} s")
+        words.append(f"{cells.MOVES.difference(later)} s")
     return ", ".join(words)
+
+
+def last_over_second(runs: pd.DataFrame) -> str:
+    """Return the median ratio of the error of the last lap to that of the second one."""
+    ratio = column_of(runs, "rms_error_evaluated") / column_of(runs, "rms_error_second_lap")
+    return cells.short(median_with_interval(ratio.where(runs["status"] == COMPLETED)), 2)
 
 
 def long_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the errors of the second and the last lap of half an hour, and the outcomes of the runs."""
-    rows = []
-    for curve in CURVES:
-        for name, own in by_method(load_runs(folder / curve)):
-            done = own["status"] == COMPLETED
-            ratio = column_of(own, "rms_error_evaluated") / column_of(own, "rms_error_second_lap")
-            rows.append({
-                "method": quoted(name),
-                "curve": curve,
-                "second lap, mm": millimetres(own, "rms_error_second_lap"),
-                "last lap, mm": millimetres(own),
-                "last over second": short(median_with_interval(ratio.where(done)), 2),
-                "outcomes": counted(own),
-            })  # fmt: skip
+    shown = {
+        "second lap, mm": lambda runs: cells.millimetres(runs, "rms_error_second_lap"),
+        "last lap, mm": cells.millimetres,
+        "last over second": last_over_second,
+        "outcomes": cells.counted,
+    }
+    rows = [
+        {"method": row["method"], "curve": curve} | row
+        for curve in CURVES
+        for row in cells.rows_by_method(load_runs(folder / curve), shown)
+    ]
     return {"long": pd.DataFrame(rows)}
 
 
 def ends_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the outcomes for targets out of reach and for starts with the arm stretched."""
-    unreachable, singular = (load_runs(folder / part) for part in ("unreachable", "singular_start"))
-    rows = []
-    for name, own in by_method(unreachable):
-        other = singular[singular["controller"] == name]
-        rows.append({
-            "method": quoted(name),
-            "target out of reach": counted(own),
-            "error at the end, mm": millimetres(own, "steady_state_error", 0),
-            "arm stretched at the start": counted(other),
-            "settling time, s": settling(other),
-        })  # fmt: skip
-    return {"ends": pd.DataFrame(rows)}
-
-
-def counted(runs: pd.DataFrame) -> str:
-    """Return the outcomes of runs with their numbers."""
-    return ", ".join(f"{count} {word}" for word, count in outcomes(runs).value_counts().items())
+    unreachable = {
+        "target out of reach": cells.counted,
+        "error at the end, mm": lambda runs: cells.millimetres(runs, "steady_state_error", 0),
+    }
+    singular_start = {"arm stretched at the start": cells.counted, "settling time, s": cells.settling}
+    shown = {"unreachable": unreachable, "singular_start": singular_start}
+    parts = [cells.rows_by_method(load_runs(folder / part), each) for part, each in shown.items()]
+    return {"ends": pd.DataFrame(one | other for one, other in zip(*parts, strict=True))}
 
 
 def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
@@ -124,28 +113,14 @@ def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
     made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
     for words, parts in changes.items():
         changed = {engine: load_runs(folder / part) for engine, part in parts.items()}
-        for table, task, metric, never, digits, factor in (
-            ("dynamics", "random", "settling_time_s", MOVE, 2, 1.0),
-            ("dynamics_circle", "circle", "rms_error_evaluated", LOST, 1, 1e3),
-        ):
+        for table, measure in zip(made.values(), (cells.MOVES, cells.CIRCLES), strict=True):
             rows = {engine: {"changed": words, "plant": engine} for engine in ENGINES}
             for name in RENDERED:
-                both = {engine: changed_and_usual(changed[engine], usual[engine], name, task) for engine in ENGINES}
-                pairs = [("changed", "usual")]
-                cells = next(differences(both, pairs, metric=metric, never=never, digits=digits, factor=factor))
-                for engine in ENGINES:
-                    rows[engine][quoted(name)] = cells[engine]
-            made[table] += rows.values()
+                both = {engine: cells.changed_and_usual(changed[engine], usual[engine], name) for engine in ENGINES}
+                for engine, cell in next(measure.on_engines(both, [cells.CHANGED])).items():
+                    rows[engine][cells.quoted(name)] = cell
+            table.extend(rows.values())
     return {name: pd.DataFrame(rows) for name, rows in made.items()}
-
-
-def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame, name: str, task: str) -> pd.DataFrame:
-    """Return the runs of a method in a task under two names, `changed` and `usual`."""
-    labelled = (("changed", changed), ("usual", usual))
-    return pd.concat(
-        runs[(runs["controller"] == name) & (runs["task"] == task)].assign(controller=label, plant="")
-        for label, runs in labelled
-    )
 
 
 def part_of(words: str, engine: str) -> str:
@@ -153,10 +128,10 @@ def part_of(words: str, engine: str) -> str:
     return f"{engine}_{words.replace(' ', '_')}"
 
 
-def rendered(plant: str, *settings: str) -> tuple[str, ...]:
-    """Return the sweep of moves and circles on a rendered plant with some settings."""
-    options = [word for each in settings for word in ("--set", f"{plant}.{each}")]
-    return sweep(plant, RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT, *bare(plant), *options)
+def rendered(plant: str, switched: Words = ()) -> Words:
+    """Return the sweep of moves and circles on a rendered plant with some of its settings switched."""
+    changes = settings(f"{plant}.{each}" for each in switched)
+    return sweep(plant, RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT, *changes)
 
 
 DYNAMICS_SEEDS: Final = "47000:47008"
@@ -178,9 +153,7 @@ RATES_STUDY = Study(
     "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic`, 10 on each physics engine",
     35,
     {"kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS)}
-    | on_engines(
-        lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT, *bare(plant))
-    ),
+    | on_engines(lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT)),
     rates_table,
 )
 LONG = Study(
@@ -188,7 +161,7 @@ LONG = Study(
     "half an hour on the circle and the lemniscate",
     30,
     {
-        curve: sweep("kinematic", BOTH, "endurance", "45000:45010", "--set", f'endurance.curve="{curve}"')
+        curve: sweep("kinematic", BOTH, "endurance", "45000:45010", *settings([f'endurance.curve="{curve}"']))
         for curve in CURVES
     },
     long_table,
@@ -207,9 +180,9 @@ DYNAMICS = Study(
     {"kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT)}
     | on_engines(rendered)
     | {
-        part_of(words, engine): rendered(engine, *settings)
-        for words, settings in SWITCHES.items()
-        for engine in ENGINES
+        part_of(words, engine): command
+        for words, switched in SWITCHES.items()
+        for engine, command in on_engines(partial(rendered, switched=switched)).items()
     },
     dynamics_tables,
 )

@@ -1,27 +1,33 @@
-"""A study behind tables and pictures of the pages, as `make results` carries it out."""
+"""A study behind tables and pictures of the pages, as `make results` carries it out, and the methods they compare."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Final, TypeAlias
 
 import pandas as pd
+
+from servobench.controllers.methods import METHODS
+from servobench.controllers.methods import PUBLISHED as SUFFIX
 
 Tables: TypeAlias = Mapping[str, pd.DataFrame]  # text cells, by name of the table
 Words: TypeAlias = tuple[str, ...]  # arguments of `servobench`, or a script of this project and its arguments
 Command: TypeAlias = Words | Callable[[Path], Words]
+ENGINES: Final = ("bullet", "mujoco")
+BETTER: Final = "arm_mfac"
+FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
+SIX: Final = (BETTER, "map_mfac", *FOUR)
+PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))  # without any aid, the law as printed
+EQUIPPED: Final = tuple(name for name in METHODS if name not in PUBLISHED)  # with all aids that help it
+BOTH: Final = EQUIPPED + PUBLISHED
+RENDERED: Final = (*SIX, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in SIX))
 
 
-def nothing(_folder: Path) -> dict[str, pd.DataFrame]:
-    """Return no table."""
+def nothing(_folder: Path) -> dict[str, Any]:
+    """Return no table and no file."""
     return {}
-
-
-def no_files(_folder: Path) -> Iterable[tuple[str, bytes]]:
-    """Return no file."""
-    return ()
 
 
 @dataclass(frozen=True)
@@ -43,10 +49,23 @@ class Study:
     minutes: float
     commands: Mapping[str, Command]
     tables: Callable[[Path], Tables] = nothing
-    files: Callable[[Path], Iterable[tuple[str, bytes]]] = no_files
+    files: Callable[[Path], Mapping[str, bytes]] = nothing
 
 
 def sweep(plants: str, controllers: Iterable[str], tasks: str, seeds: str, *options: str) -> Words:
     """Return the arguments of a sweep."""
     names = ",".join(controllers)
     return ("sweep", "--plants", plants, "--controllers", names, "--tasks", tasks, "--seeds", seeds, *options)
+
+
+def settings(assignments: Iterable[str]) -> Words:
+    """Return the options that set `section.key=value` for each assignment."""
+    return tuple(word for each in assignments for word in ("--set", each))
+
+
+def on_engines(command: Callable[[str], Words]) -> dict[str, Words]:
+    """Return a command for each physics engine, by the name of its plant.
+
+    Table and floor are left out of the images: the observations are the same, bit for bit.
+    """
+    return {engine: (*command(engine), *settings([f"{engine}.scenery=false"])) for engine in ENGINES}

@@ -1,22 +1,21 @@
-"""Where methods break: worse worlds one by one, every pair of law and estimator, and the robustness map."""
+"""Where methods break: worse worlds, chains of learners, every pair of law and estimator, every sensing set-up."""
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Final
 
 import pandas as pd
-from PIL import Image
 
-from page_studies.methods import BOTH, FOUR, SUFFIX, by_method, millimetres, quoted, settled, settling, short
-from page_studies.study import Study, sweep
+from page_studies import cells
+from page_studies.study import BOTH, Study, Words, settings, sweep
 from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.harness.analysis.comparison import column_of
 from servobench.harness.analysis.statistics import median_with_interval
 from servobench.harness.batch.results import load_runs
-from servobench.harness.run.result import COMPLETED
 
 SEEDS = "500:600"
 MISMATCHES = (
@@ -30,8 +29,6 @@ PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
 WITHOUT = "mfac+constant"  # the map alone
 LEARNERS = (WITHOUT, "mfac+arm", "mfac+ukf", "mfac+rbf", "mfac+true")
 LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
-MAPPED = ("map_mfac", *(name + SUFFIX for name in FOUR))  # best equipped all stay above 90 % everywhere
-COLOURS = 128  # of a picture's palette
 
 
 def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -45,8 +42,8 @@ def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
     }
     methods = dict.fromkeys(name for part in parts for name in part["controller"])
     rows = [
-        {"method": quoted(name)}
-        | {title: str(settled(own[own["controller"] == name])) for title, own in worlds.items()}
+        {"method": cells.quoted(name)}
+        | {title: str(cells.settled(own[own["controller"] == name])) for title, own in worlds.items()}
         for name in methods
     ]
     return {"worlds": pd.DataFrame(rows)}
@@ -58,52 +55,65 @@ def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
     rows = []
     for world, own in circles.groupby("mismatch", sort=False):
         without = own[own["controller"] == WITHOUT].set_index("seed")["rms_error_evaluated"]
-        for name, each in by_method(own):
+        for name, each in cells.by_method(own):
             move = moves[(moves["mismatch"] == world) & (moves["controller"] == name)]
             ratio = each.set_index("seed")["rms_error_evaluated"] / without
             rows.append({
                 "world": f"`{world}`",
-                "estimator": quoted(name.partition("+")[2]),
-                "circle, RMS of the second lap, mm": millimetres(each, digits=2),
-                "over that of `constant`": short(median_with_interval(ratio), 2),
-                "moves settled": str(settled(move)),
-                "settling time, s": settling(move),
+                "estimator": cells.quoted(name.partition("+")[2]),
+                "circle, RMS of the second lap, mm": cells.millimetres(each, digits=2),
+                "over that of `constant`": cells.short(median_with_interval(ratio), 2),
+                "moves settled": str(cells.settled(move)),
+                "settling time, s": cells.settling(move),
             })  # fmt: skip
     return {"learning": pd.DataFrame(rows)}
 
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how the runs of every pair of law and estimator ended."""
-    rows = []
-    for name, own in by_method(load_runs(folder / "pairs")):
-        early = own.loc[own["status"] != COMPLETED, "status"].value_counts()
-        ends = ", ".join(f"{count} {kind}" for kind, count in early.items())
-        rows.append({"pair": quoted(name), "runs": str(len(own)), "settled": str(settled(own)), "ended early": ends})
-    return {"pairs": pd.DataFrame(rows)}
+    shown = {
+        "runs": lambda runs: str(len(runs)),
+        "settled": lambda runs: str(cells.settled(runs)),
+        "ended early": cells.ended_early,
+    }
+    return {"pairs": pd.DataFrame(cells.rows_by_method(load_runs(folder / "pairs"), shown, title="pair"))}
 
 
-def map_pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield the two pictures of the robustness map."""
-    for path in sorted((folder / "map" / "figures").glob("*.png")):
-        with Image.open(path) as picture:
-            yield f"pictures/{path.name}", small(picture)
-
-
-def chain(names: Iterable[str]) -> tuple[str, ...]:
+def chain(names: Iterable[str]) -> Words:
     """Return the settings of the same chain for all pairs; the true Jacobian needs no map."""
     values = {**{f"aids.{key}": word for key, word in EQUIPPED.items()}, "law.gain": 27.7, "law.step_weight": 4e-4}
-    options: list[str] = []
-    for name in names:
-        own = values | {"aids.model": "own"} if name.endswith("+true") else values
-        options += [word for key, value in own.items() for word in ("--set", f"{name}.{key}={json.dumps(value)}")]
-    return tuple(options)
+    own = {name: values | ({"aids.model": "own"} if name.endswith("+true") else {}) for name in names}
+    return settings(f"{name}.{key}={json.dumps(value)}" for name, each in own.items() for key, value in each.items())
 
 
-def small(picture: Image.Image) -> bytes:
-    """Return a picture as PNG with a palette."""
-    stream = io.BytesIO()
-    picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
-    return stream.getvalue()
+def path_ratio(runs: pd.DataFrame) -> str:
+    """Return the median ratio of the path of the features to the straight one, with its interval."""
+    return cells.short(median_with_interval(column_of(runs, "path_length_ratio"), missing="left_out"), 2)
+
+
+def in_view(runs: pd.DataFrame) -> str:
+    """Return the mean share of features that were seen [%]."""
+    return f"{100.0 * (1.0 - column_of(runs, 'feature_invalid_fraction').mean()):.1f}"
+
+
+SENSING_CELLS: Final[Mapping[str, Callable[[pd.DataFrame], str]]] = {
+    "eyes": cells.share, "eyes_time": cells.settling, "eyes_path": path_ratio, "eyes_view": in_view,
+}  # fmt: skip
+"""Name of a table -> what a cell of it says of the runs of a method under a sensing set-up."""
+
+
+def sensing_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return a table for each measure, with a row for each method and a column for each sensing set-up."""
+    runs = load_runs(folder / "runs")
+    set_ups = dict.fromkeys(runs["sensing"])
+    return {
+        name: pd.DataFrame(
+            {"method": cells.quoted(method)}
+            | {cells.quoted(each): cell(own[own["sensing"] == each]) for each in set_ups}
+            for method, own in cells.by_method(runs)
+        )
+        for name, cell in SENSING_CELLS.items()
+    }
 
 
 WORLDS = Study(
@@ -134,10 +144,10 @@ PAIRS_STUDY = Study(
     {"pairs": sweep("kinematic", PAIRS, "random", "500:504")},
     pairs_table,
 )
-MAP = Study(
-    "robustness",
-    "the robustness map: its two pictures",
-    2,
-    {"map": ("robustness", "--plant", "fmu", "--controllers", ",".join(MAPPED), "--seeds", "50000:50030")},
-    files=map_pictures,
+SENSING = Study(
+    "eyes",
+    "every method under every sensing set-up, 200 robots",
+    30,
+    {"runs": sweep("kinematic", BOTH, "random", "66000:66200", "--sensing", "all")},
+    sensing_tables,
 )

@@ -230,10 +230,9 @@ def build_block(block: Block, workers: Workers, progress: Progress) -> None:
 
 def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
     """Build a run in a worker and report the training of its networks, and a wrong configuration."""
-    block, *_ = _unpack(packed)
+    block, *_ = _receive(packed)
+    tell(None)
     with offering(block.own):
-        _load(block)
-        tell(None)
         try:
             build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
         except ConfigurationError as error:
@@ -243,30 +242,26 @@ def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
 def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
     """Carry a block out in a worker; where it cannot be read, for instance without its plug-in, report why."""
     try:
-        block, steps, keep = _unpack(packed)
+        block, steps, keep = _receive(packed)
     except Exception as error:  # noqa: BLE001 - of a plug-in
         tell({"unreadable": astuple(Ending.of(error))})
         return
-    with offering(block.own):
-        _load(block)
     tell(None)  # the time limit begins after the imports
     _carry_out(block, lambda result: tell(pack_result(result)), steps, keep)
 
 
-def _unpack(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
+def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
+    """Return the content of a task; the plant and the controller are imported, of one that cannot be the row tells."""
     sources, content = packed
     for source in sources:
         source.load()
     unpacked: tuple[Block, bool, Path | None] = pickle.loads(content)
-    return unpacked
-
-
-def _load(block: Block) -> None:
-    """Import the plant and the controller of a block; of one that cannot be imported the row tells."""
+    block, *_ = unpacked
     request = block.jobs[0].cell.request
-    with contextlib.suppress(BaseException):
+    with offering(block.own), contextlib.suppress(BaseException):
         find_plant(request.plant)
         find_controller(request.controller)
+    return unpacked
 
 
 def _carry_out(
@@ -375,11 +370,6 @@ SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker a
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
 
 
-def default_workers() -> int:
-    """Return the number of worker processes that are used where none is given."""
-    return min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
-
-
 def can_travel(own: Sequence[Offer]) -> bool:
     """Return whether a worker process can receive controllers and plants that users gave."""
     try:
@@ -418,7 +408,7 @@ def open_workers(
     """
     if scheduler is not None and count is not None:
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
-    count = count or default_workers()
+    count = count or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:

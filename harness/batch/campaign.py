@@ -12,6 +12,7 @@ import json
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -122,7 +123,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         check_empty(folder, can_resume=len(campaign.cells) > 1)
     elif not is_unused(folder):
         check_resumable(folder)
-    runs = survey(Grid(_request, campaign.cells))
+    runs = survey(Grid(attrgetter("request"), campaign.cells))
     own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
@@ -153,7 +154,7 @@ def _carry_out_at(
     manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
-    with locked(folder, new=not how.resume) as lock:
+    with locked(folder) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
         resumed = how.resume and not is_unused(folder)  # under the lock: another process may have begun meanwhile
@@ -162,10 +163,10 @@ def _carry_out_at(
         else:
             results.create_folder(folder, manifest)
         if not resumed or not results.is_whole(folder, runs.count):
-            for index, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
+            for block, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
                 with writing(folder):
                     lock.check()  # the folder may have been removed
-                results.write_part(folder, index, outcome, manifest["campaign"])
+                results.write_part(folder, block.index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
         results.put_together(folder, manifest)
 
@@ -202,17 +203,6 @@ def prepare_folder(folder: Path, manifest: dict[str, Any], observer: Observer) -
         ConfigurationError: not a results folder, or one of other runs or settings.
     """
     restored = restore_manifest(folder, manifest)
-    check_same_campaign(folder, manifest, observer)
-    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
-        observer.note(f"note: {line}")
-
-
-def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Observer) -> None:
-    """Refuse to resume with other runs or settings.
-
-    Raises:
-        ConfigurationError: not a results folder, or one of other runs or settings.
-    """
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest["campaign"]:
         raise ConfigurationError(
@@ -227,6 +217,8 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
     for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {things}; later runs may differ")
+    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
+        observer.note(f"note: {line}")
 
 
 class _Jobs:
@@ -263,8 +255,8 @@ def _carry_out_missing(
     folder: Path,
     place: Workers,
     how: Execution,
-) -> Iterator[tuple[int, list[RunResult]]]:
-    """Carry out the runs whose part is not in the folder; yield the results of each block with its first index."""
+) -> Iterator[tuple[Block, list[RunResult]]]:
+    """Carry out the runs whose part is not in the folder; yield each block with its results."""
     total = len(campaign.cells)
     done = results.finished_runs(folder)
     missing = total - sum(map(len, done))
@@ -277,12 +269,7 @@ def _carry_out_missing(
         own,
     )
     keep = folder if campaign.steps and not place.cluster else None
-    for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
-        yield block.index, outcome
-
-
-def _request(cell: Cell) -> RunRequest:
-    return cell.request
+    return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
 
 
 def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: bool) -> None:

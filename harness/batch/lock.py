@@ -83,18 +83,15 @@ class Lock:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, *, new: bool = False) -> Iterator[Lock]:
+def locked(folder: Path) -> Iterator[Lock]:
     """Keep other processes from writing the same folder; the lock of a process that died does not count.
 
     Args:
         folder: made if needed.
-        new: refuse a folder with anything in it.
 
     Raises:
-        ConfigurationError: another process writes the folder, it has something in it, or it cannot be made.
+        ConfigurationError: another process writes the folder, or it cannot be made.
     """
-    if new:
-        check_empty(folder)
     path = folder / LOCK
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -88,10 +88,8 @@ def describe_batch(
 
 def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield names of controllers, plants and tasks that others have installed, and the record of each."""
-    points = {name: CONTROLLER_REGISTRY.published(name) for name in runs.controllers}
-    points |= {name: PLANT_REGISTRY.published(name) for name in runs.plants}
-    points |= {name: TASK_REGISTRY.published(name) for name in runs.tasks}
-    for name, point in points.items():
+    kinds = (CONTROLLER_REGISTRY, runs.controllers), (PLANT_REGISTRY, runs.plants), (TASK_REGISTRY, runs.tasks)
+    for name, point in ((name, registry.published(name)) for registry, names in kinds for name in names):
         if point is not None:
             made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
             yield name, {"place": point.value, "distribution": made, "sha256": digest_of_module(point.module)}

@@ -31,6 +31,7 @@ MAX_SEEDS: Final = 1_000_000  # of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
 MAX_SHOWN: Final = 200  # [characters] of a given text, in a message
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
+TUNING_WORDS: Final = f"{TUNING.start}:{TUNING.stop}"
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def tuning_seeds(count: int, offset: int = 0) -> tuple[int, ...]:
         raise ConfigurationError(f"the number of tuning seeds must be at least 1, got {count}")
     if offset < 0 or offset + count > len(TUNING):
         raise ConfigurationError(
-            f"{count} seeds from {TUNING.start + offset} on leave the tuning range {_words()}; "
+            f"{count} seeds from {TUNING.start + offset} on leave the tuning range {TUNING_WORDS}; "
             f"count and offset must not be negative and together at most {len(TUNING)}"
         )
     return tuple(TUNING[offset : offset + count])
@@ -134,13 +135,9 @@ def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
     if found:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise ConfigurationError(
-            f"seed {found[0]}{more} cannot be used to judge: {_words()} are kept for tuning; "
+            f"seed {found[0]}{more} cannot be used to judge: {TUNING_WORDS} are kept for tuning; "
             f"take seeds below {TUNING.start} or from {TUNING.stop} on"
         )
-
-
-def _words() -> str:
-    return f"{TUNING.start}:{TUNING.stop}"
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ import re
 import resource
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import psutil
 
@@ -49,9 +49,9 @@ class Bounds:
         """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
         time, memory = self.run_timeout, self.run_memory
         if foreign:
-            machine = machine_memory()
             time = FOREIGN_TIME if time is None else time
-            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine / count) if memory is None else memory
+            share = FOREIGN_SHARE * psutil.virtual_memory().total / count
+            memory = max(LEAST_FOREIGN_MEMORY, share) if memory is None else memory
         seconds = None if time is None or math.isinf(time) else time
         size = None if memory is None or math.isinf(memory) else int(memory)
         return Limits(seconds, size, addresses=self.run_memory is not None)
@@ -105,25 +105,25 @@ def _children(process: int) -> list[int]:
 
 def resident_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold; shared memory counts for each."""
-    return sum(_memory(process, "rss") for process in processes)
+    return sum(_ask(process, lambda each: each.memory_info().rss) or 0 for process in processes)
 
 
 def own_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    return sum(_memory(process, "pss") for process in processes)
+    return sum(_ask(process, lambda each: each.memory_full_info().pss) or 0 for process in processes)
 
 
-def _memory(process: int, kind: str) -> int:
+def is_stopped(process: int | None) -> bool:
+    """Return whether a process was stopped by a signal."""
+    return bool(_ask(process, lambda each: each.status() == psutil.STATUS_STOPPED))
+
+
+def _ask(process: int | None, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer
+    """Return the answer of the system about a process; None if it has ended."""
     try:
-        of = psutil.Process(process)
-        return int(getattr(of.memory_info() if kind == "rss" else of.memory_full_info(), kind))
+        return question(psutil.Process(process))
     except psutil.Error:
-        return 0
-
-
-def machine_memory() -> int:
-    """Return the memory [bytes] of this machine."""
-    return int(psutil.virtual_memory().total)
+        return None
 
 
 def limit_resources(memory: int | None) -> None:
@@ -137,14 +137,6 @@ def limit_resources(memory: int | None) -> None:
         soft = psutil.Process().memory_info().vms + memory
         if hard == resource.RLIM_INFINITY or soft < hard:
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def is_stopped(process: int | None) -> bool:
-    """Return whether a process was stopped by a signal."""
-    try:
-        return bool(psutil.Process(process).status() == psutil.STATUS_STOPPED)
-    except psutil.Error:
-        return False
 
 
 def end_descendants() -> None:

@@ -20,7 +20,7 @@ from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, Registry, find_controller, installed_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
-from servobench.harness.config.source import PACKAGES, PLACE, folder_of_module, is_below, place_in_trace
+from servobench.harness.config.source import NAMED, PLACE, place_in_trace
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolution import resolve
@@ -28,7 +28,6 @@ from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault
-from servobench.plant.contract.files import user_path
 
 if TYPE_CHECKING:
     from servobench.fmus.inspection import Validation
@@ -38,7 +37,6 @@ TASK: Final = "exp1"
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
 LOADING: Final = "loading"  # the step before the first check
-ENGINE: Final = Path(__file__).parents[2]  # whose own lines are not the place of a defect
 OUTPUTS: Final = (1, 2)  # descriptors of standard output and error
 
 Word: TypeAlias = Literal["controller", "plant"]
@@ -79,11 +77,24 @@ class _Trains(BaseException):
     """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
 
 
+def explain(end: Ending, limit: float) -> str:
+    """Return why code of a user did not return within its limit [s], with the place in it where that is known."""
+    place = place_in_trace(end.trace)
+    if end.status == TIMED_OUT:
+        return f"{place}no answer after {limit:g} s; is there a loop without an end, or something that waits?"
+    how = end.reason.removeprefix(f"{LOST}: ")
+    if how.startswith("SIG"):
+        return f"{place}it killed the process by {how}; compiled code wrote or read outside of its memory"
+    if how.startswith("exit code"):
+        return f"{place}it ended the process with {how}; raise an error instead, so that the other runs go on"
+    return place + end.reason.replace("the run", "it", 1)
+
+
 def attempt(
     function: Callable[..., Any],
     *arguments: object,
     limit: float,
-    why: Callable[[Ending], str],
+    why: Callable[[Ending, float], str] = explain,
     hear: Tell = lambda _: None,
     quiet: bool = True,
 ) -> Outcome:
@@ -108,7 +119,7 @@ def attempt(
 
     end = call(_attempt_here, (function, arguments, quiet), Bounds(limit).limits(1, foreign=True), receive)
     if end is not None:
-        outcome.failure = why(end)
+        outcome.failure = why(end, limit)
     return outcome
 
 
@@ -137,10 +148,8 @@ def choose(word: Word, given: str) -> str:
         ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
     registry = REGISTRIES[word]
-    folder = _folder(registry, given)
-    if folder is not None:
-        limit = IMPORT_LIMIT
-        found = attempt(_choose, word, given, limit=limit, why=_explainer(folder, limit))
+    if _is_foreign(registry, given):
+        found = attempt(_choose, word, given, limit=IMPORT_LIMIT)
         if found.refusal or found.failure:
             raise ConfigurationError(found.refusal or f"{given} cannot be imported: {found.failure}")
     return registry.choose(given)
@@ -150,22 +159,14 @@ def _choose(_tell: Tell, word: Word, given: str) -> str:
     return REGISTRIES[word].choose(given)
 
 
-def _folder(registry: Registry[Any], given: str) -> Path | None:
-    """Return the folder of the code that a text names; None for a name of this package, and for an unknown one.
-
-    Raises:
-        ConfigurationError: a path in a home folder that is not known.
-    """
-    point = registry.published(given)
-    if point is not None:
-        return folder_of_module(point.module)
+def _is_foreign(registry: Registry[Any], given: str) -> bool:
+    """Return whether a text names code that is not of this package; an unknown name does not."""
+    if registry.published(given) is not None:
+        return True
     found = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
-    if found is None:
-        return None
-    try:
-        return user_path(found["file"]).resolve().parent if found["file"] else folder_of_module(found["module"])
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+    if found is not None and found["module"]:
+        NAMED.add(found["module"].partition(".")[0])
+    return found is not None
 
 
 def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
@@ -182,8 +183,7 @@ def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
 
 def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
     """Try one in a sandbox."""
-    why = _explainer(folder_of_module(point.module), TRIAL_LIMIT)
-    found = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT, why=why)
+    found = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT)
     match found.answer:
         case [str(summary), str(fault)]:
             return Tried(point.name, summary, fault)
@@ -231,7 +231,7 @@ def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Findi
             case str(check):
                 current.append(check)
 
-    found = attempt(_check, checks, subject, limit=limit, why=lambda end: explain(end, _is_users, limit), hear=receive)
+    found = attempt(_check, checks, subject, limit=limit, hear=receive)
     if found.refusal:
         raise ConfigurationError(found.refusal)
     if found.failure:
@@ -250,7 +250,7 @@ def validate(path: Path) -> Validation:
     """
     from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
 
-    found = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end: end.reason, quiet=False)
+    found = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
     if found.refusal:
         raise ConfigurationError(found.refusal)
     match found.answer:
@@ -267,29 +267,6 @@ def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:
     except (ValueError, FmuError) as error:
         raise ConfigurationError(str(error)) from error
     return found.problems, found.deviation
-
-
-def _explainer(folder: Path, limit: float) -> Callable[[Ending], str]:
-    return lambda end: explain(end, lambda path: is_below(path, folder), limit)
-
-
-def explain(end: Ending, is_users: Callable[[Path], bool], limit: float) -> str:
-    """Return why code of a user did not return, with the place in it where that is known.
-
-    Args:
-        end: of its process.
-        is_users: whether a file is the user's.
-        limit: [s] that it had.
-    """
-    place = place_in_trace(end.trace, is_users)
-    if end.status == TIMED_OUT:
-        return f"{place}no answer after {limit:g} s; is there a loop without an end, or something that waits?"
-    how = end.reason.removeprefix(f"{LOST}: ")
-    if how.startswith("SIG"):
-        return f"{place}it killed the process by {how}; compiled code wrote or read outside of its memory"
-    if how.startswith("exit code"):
-        return f"{place}it ended the process with {how}; raise an error instead, so that the other runs go on"
-    return place + end.reason.replace("the run", "it", 1)
 
 
 def _build_controller(name: str, robot: str) -> None:
@@ -330,8 +307,3 @@ def _print_nowhere() -> None:
     for descriptor in OUTPUTS:
         os.dup2(nothing.fileno(), descriptor)
     sys.stdout = sys.stderr = nothing
-
-
-def _is_users(path: Path) -> bool:
-    inside = any(path.is_relative_to(folder) for folder in (Path(os.__file__).parent, ENGINE))
-    return not (inside or PACKAGES in path.parts or str(path).startswith("<"))

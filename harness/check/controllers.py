@@ -14,9 +14,8 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws
-from servobench.harness.config.defaults import default_config
-from servobench.harness.config.entries import folder_of
 from servobench.harness.config.registry import choose_controller, find_controller, offering
+from servobench.harness.config.settings import default_config
 from servobench.harness.run.contract import HeldController
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -61,13 +60,13 @@ class ControllerChecks:
 
     def __init__(self, entry: ControllerEntry) -> None:
         """Prepare the checks."""
-        self.entry, self.steps, self.folder = entry, STEPS, folder_of(entry.build)
+        self.entry, self.steps = entry, STEPS
         self._times: list[float] = []
         self._printed = ""
 
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
         """Yield the finding of each check."""
-        return findings_of(self.checks(), self.folder, begin)
+        return findings_of(self.checks(), begin)
 
     def checks(self) -> list[Check]:
         """Return the checks in their order."""
@@ -129,7 +128,7 @@ class ControllerChecks:
 
     def repeatable(self) -> None:
         """The same seed gives the same commands."""
-        with watching_draws(self.folder) as draws:
+        with watching_draws() as draws:
             first, second = (self._driver().begin().run(self.steps) for _ in range(2))
         if np.array_equal(first, second):
             return

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of, report
-from servobench.harness.config.entries import folder_of
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.harness.run.contract import HeldPlant
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
@@ -62,7 +61,7 @@ class PlantChecks:
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
         """Yield the finding of each check; the plant is closed at the end."""
         try:
-            yield from findings_of(self.checks(), folder_of(self.entry.build), begin)
+            yield from findings_of(self.checks(), begin)
         finally:
             for plant in self._plant:
                 with contextlib.suppress(Exception):  # the check of `close` has reported it

@@ -80,12 +80,11 @@ class Check(NamedTuple):
     """checks without which this one finds nothing new"""
 
 
-def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], None]) -> Iterator[Finding]:
+def findings_of(checks: Iterable[Check], begin: Callable[[str], None]) -> Iterator[Finding]:
     """Carry out checks one after the other and yield the finding of each.
 
     Args:
         checks: a check is left out if one that it needs was not ok.
-        folder: that of the user's code.
         begin: called with the name of each check before it is carried out.
     """
     good: set[str] = set()
@@ -101,7 +100,7 @@ def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], No
         except WrongAnswer as error:
             yield Finding(check.name, "failed", f"{at(error.method)}: {error}")
         except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
-            yield Finding(check.name, "failed", describe_at(error, folder) + _remedy(error))
+            yield Finding(check.name, "failed", describe_at(error) + _remedy(error))
         else:
             good.add(check.name)
             yield Finding(check.name, "note", note) if note else Finding(check.name, "ok")

@@ -18,7 +18,7 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.harness.check.report import CheckFailed, at
-from servobench.harness.config.source import PACKAGES, show
+from servobench.harness.config.source import is_users, show
 from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.plant.bench.plant import Plant
@@ -205,21 +205,16 @@ class Draws:
 
 
 @contextlib.contextmanager
-def watching_draws(folder: Path) -> Iterator[Draws]:
-    """Yield the places and generators of draws without a seed within the context.
-
-    Args:
-        folder: that of the user's code.
-    """
+def watching_draws() -> Iterator[Draws]:
+    """Yield the places and generators of draws without a seed by code of users within the context."""
     found = Draws()
     source: Any = np.random.bit_generator
     original = source.randbits
 
     def noted(bits: int) -> int:
         for frame in reversed(traceback.extract_stack()):
-            path = Path(frame.filename)
-            if path.is_relative_to(folder) and PACKAGES not in path.parts:
-                found.places.append(f"{show(path)}:{frame.lineno}")
+            if is_users(frame.filename):
+                found.places.append(f"{show(Path(frame.filename))}:{frame.lineno}")
                 break
         return int(original(bits))
 

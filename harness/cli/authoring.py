@@ -13,7 +13,8 @@ import typer
 
 from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, option
-from servobench.harness.cli.terminal import FAILED, console, print_tables, refuse, say, writing
+from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
+from servobench.plant.contract.faults import ConfigurationError
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
@@ -28,20 +29,20 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
-    folder: Annotated[Path, option("--folder", "FOLDER", "Folder for the files.")] = Path(),
+    folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
 ) -> None:
     """Write a commented controller or plant, and its test."""
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
-        refuse(f"{kind!r} is nothing to begin with; the command is {commands}")
+        raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
     module = name.removesuffix(".py")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module) or keyword.iskeyword(module) or module.startswith(PREFIX):
-        refuse(f"the name must be one of a Python module, such as my_law, got {name!r}")
+        raise ConfigurationError(f"the name must be one of a Python module, such as my_law, got {name!r}")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
     wanted = {folder / f"{module}.py": kind, folder / f"{PREFIX}{module}.py": f"{PREFIX}{kind}"}
     for path in wanted:
         if path.exists():
-            refuse(f"{path} exists already and is left as it is; take another name or --folder")
+            raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
@@ -57,7 +58,7 @@ def check(
     subject: Annotated[
         list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
     ],
-    limit: Annotated[float, option("--limit", "SECONDS", "Time limit of one check [s].", min=1.0)] = 60.0,
+    limit: Annotated[float, option("SECONDS", "Time limit of one check [s].", min=1.0)] = 60.0,
 ) -> None:
     """Check a controller or a plant against its contract.
 
@@ -71,14 +72,14 @@ def check(
     from servobench.harness.check.report import Finding
 
     if subject == ["plant"]:
-        refuse("check plant needs a plant, such as servobench check plant ./cell.py")
+        raise ConfigurationError("check plant needs a plant, such as servobench check plant ./cell.py")
     if subject[0] == "plant" and len(subject) == 2:
         checks: Checks = check_plant
         name = subject[1]
     elif len(subject) == 1:
         checks, name = check_controller, subject[0]
     else:
-        refuse(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
+        raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
     findings: list[Finding] = []
 
     def hear(finding: Finding) -> None:
@@ -100,14 +101,12 @@ def shadow(
         Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
     ],
     controller: Annotated[
-        str | None, option("--controller", CONTROLLER, "Name or file of the controller; default: that of the run.")
+        str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[
-        Path | None, option("--out", "FILE", "CSV file for the commands of the controller at each instant.")
-    ] = None,
+    out: Annotated[Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
 
@@ -119,12 +118,12 @@ def shadow(
     from servobench.harness.run.shadow import shadow as see
 
     if not log.exists():
-        refuse(f"{log} does not exist; wanted a results folder or a table")
+        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     chosen = None if controller is None else choose_controller(controller)
     if log.is_dir():
         resolved, table = logged_in_folder(log, run, chosen)
     elif chosen is None:
-        refuse(f"{log} does not say which controller to show it to; name one with --controller")
+        raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
     else:
         resolved, table = logged_in_file(log, chosen, robot, sensing)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
@@ -134,7 +133,7 @@ def shadow(
             seen.to_csv(out, index=False)
         say(f"table in {out}")
     elif not has_commands(seen):
-        refuse(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
+        raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
     if has_commands(seen):
         rows = differences(seen).map(lambda each: each if isinstance(each, str) else f"{each:.3g}")
         print_tables([(f"{resolved.request.controller} beside the log", rows)], LEGEND)

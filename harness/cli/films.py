@@ -11,43 +11,45 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, RunIdOption, Value, option
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, refuse, say
+from servobench.harness.cli.options import (
+    CONTROLLER,
+    MISMATCH,
+    PLANT,
+    ROBOT,
+    TASK,
+    RunIdOption,
+    Value,
+    named_option,
+    option,
+)
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
 
-RECORDED = {
-    "controller": "rbfnn_mfac",
-    "task": "circle",
-    "mismatch": "moderate",
-    "robot": "ur5",
-    "seed": 0,
-}
+RECORDED = {"controller": "rbfnn_mfac", "task": "circle", "mismatch": "moderate", "robot": "ur5", "seed": 0}
 RECORDINGS = "recordings"
 
 
 def _new(name: str, value: Value | str) -> Any:  # noqa: ANN401 - typer's own word for it
-    return option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.")
+    return option(value, f"New run: {name}, default {RECORDED[name]}.")
 
 
 @dataclass(frozen=True)
 class NewRun:
     """The run that is carried out where no folder is given."""
 
-    plant: Annotated[
-        str | None,
-        option("--plant", PLANT, "New run: plant, default bullet, or mujoco without PyBullet."),
-    ] = None
+    plant: Annotated[str | None, option(PLANT, "New run: plant, default bullet, or mujoco without PyBullet.")] = None
     controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
     task: Annotated[str | None, _new("task", TASK)] = None
     mismatch: Annotated[str | None, _new("mismatch", MISMATCH)] = None
     robot: Annotated[str | None, _new("robot", ROBOT)] = None
     seed: Annotated[int | None, _new("seed", "INTEGER")] = None
     set_: Annotated[
-        list[str] | None, option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
+        list[str] | None, named_option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
     ] = None
-    config: Annotated[Path | None, option("--config", "FILE", "New run: TOML file with settings.")] = None
+    config: Annotated[Path | None, option("FILE", "New run: TOML file with settings.")] = None
 
     def given(self) -> list[str]:
         """Return the options of it that were given."""
@@ -68,16 +70,13 @@ def record(
     *,
     run: RunIdOption = None,
     new: NewRun,
-    kinds: Annotated[str, option("--kinds", "NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[
-        float, option("--begin", "SECONDS", "Time in the run at which the film begins [s].", min=0.0)
-    ] = 0.0,
+    kinds: Annotated[str, option("NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    begin: Annotated[float, option("SECONDS", "Time in the run at which the film begins [s].", min=0.0)] = 0.0,
     length: Annotated[
-        float | None,
-        option("--length", "SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001),
+        float | None, option("SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001)
     ] = None,
     out: Annotated[
-        Path | None, option("--out", "FOLDER", "Folder for the films; default: recordings in the results folder.")
+        Path | None, option("FOLDER", "Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.
@@ -105,19 +104,19 @@ def _check_writable(folder: Path) -> None:
     """Refuse a folder that takes no film before a run is carried out and drawn."""
     standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     if not standing.is_dir():
-        refuse(f"{folder} cannot be written: {standing} is a file")
+        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
     if not os.access(standing, os.W_OK | os.X_OK):
-        refuse(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
+        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or carry out a new one."""
     if folder is not None:
         if given := new.given():
-            refuse(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
         return _run_of(folder, run_id)
     if run_id is not None:
-        refuse("--run names a run of a results folder, and no folder is given")
+        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
     return _carried_out(new)
 
 

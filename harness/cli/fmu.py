@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options
-from servobench.harness.cli.options import CONTROLLER, command, option
-from servobench.harness.cli.terminal import FAILED, console, refuse, say
+from servobench.harness.cli.options import CONTROLLER, command, named_option, option
+from servobench.harness.cli.terminal import FAILED, console, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.fmus.compiler import Platform
     from servobench.fmus.product import Product
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
@@ -32,25 +33,19 @@ class Export:
     mismatch: options.MismatchOption = "none"
     robot: options.RobotOption = "ur5"
     sensing: options.SensingOption = "position"
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the run whose robot this is.")] = 0
+    seed: Annotated[int, option("INTEGER", "Seed of the run whose robot this is.")] = 0
     platforms: Annotated[
         str | None,
-        option(
-            "--platforms",
-            "NAMES",
-            "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine.",
-        ),
+        option("NAMES", "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
     ] = None
 
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        from servobench.fmus.compiler import parse_platforms
-
         try:
             yield parse_platforms(self.platforms)
         except (ValueError, OSError) as error:
-            refuse(str(error))
+            raise ConfigurationError(str(error)) from error
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
@@ -64,14 +59,11 @@ class Export:
     def arm(self, fmi: int) -> Product:
         """Return the arm, with the mismatch as start values."""
         from servobench.fmus.export import ExportOptions, default_actuation, product
-        from servobench.harness.config.robots import find_robot, find_sensing
-        from servobench.plant.contract.seeds import named_seed
-        from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+        from servobench.harness.config.robots import find_robot
+        from servobench.harness.config.settings import Settings
+        from servobench.harness.run.experiment import draw_robot
 
-        described, differs = find_robot(self.robot), Mismatch.parse(self.mismatch)
-        drawn = named_seed(self.seed, "mismatch")
-        arm, sample = sample_mismatch(differs, described, drawn)
-        model, _ = find_sensing(self.sensing).true(described, arm, sample, differs, drawn)
+        described, (model, *_) = find_robot(self.robot), draw_robot(self.request("constant", Settings()))
         words = "none" if self.mismatch == "none" else f"{self.mismatch}, seed {self.seed}"
         return product(ExportOptions(fmi, model, default_actuation(described), mismatch=words, robot=described))
 
@@ -80,17 +72,16 @@ class Export:
 @command
 def export(
     *,
-    output: Annotated[Path, option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
+    output: Annotated[Path, named_option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
     fmi: Annotated[
         int,
         option(
-            "--fmi",
             "INTEGER",
             "Version of FMI, 2 or 3. An arm has co-simulation and model exchange, a controller co-simulation.",
         ),
     ] = 2,
     controller: Annotated[
-        str | None, option("--controller", CONTROLLER, "Name or file of a controller to export instead of the arm.")
+        str | None, option(CONTROLLER, "Name or file of a controller to export instead of the arm.")
     ] = None,
     exported: Export,
     overrides: options.Overrides,
@@ -101,7 +92,7 @@ def export(
 
     settings = overrides.settings()
     if controller is None and settings.sections:
-        refuse("--config and --set are for --controller; an arm has --mismatch")
+        raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     with exported.compiling() as platforms:
         if controller is None:
             product = exported.arm(fmi)
@@ -117,8 +108,8 @@ def export(
 @command
 def ssp(
     *,
-    output: Annotated[Path, option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
-    controller: Annotated[str, option("--controller", CONTROLLER, "Name or file of the controller.")],
+    output: Annotated[Path, named_option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
+    controller: Annotated[str, option(CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,
 ) -> None:
@@ -162,22 +153,24 @@ def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
     from rich.table import Table
 
-    from servobench.fmus.inspection import read_information
+    from servobench.fmus.inspection import read_information, shape_of
 
     try:
         information = read_information(file)
     except ValueError as error:
-        refuse(str(error))
-    say(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
-    say(f"made by {information.tool}; token {information.token}")
+        raise ConfigurationError(str(error)) from error
+    described = information.description
+    say(f"{described.modelName}: FMI {described.fmiVersion}, {', '.join(information.interfaces)}")
+    token = described.guid or described.instantiationToken
+    say(f"made by {described.generationTool or 'unknown'}; token {token}")
     sources = "; with sources" if information.has_sources else ""
     say(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     for name, capabilities in information.interfaces.items():
         say(f"capabilities in {name}: {', '.join(capabilities) or 'none'}")
     table = Table("name", "causality", "size", "unit", "start")
-    for variable in information.variables:
-        size = " × ".join(map(str, variable.shape)) or "1"
-        table.add_row(variable.name, variable.causality, size, variable.unit, _shortened(variable.start))
+    for each in described.modelVariables:
+        size = " × ".join(map(str, shape_of(each))) or "1"
+        table.add_row(each.name, each.causality or "local", size, each.unit or "", _shortened(str(each.start or "")))
     console.print(table)
 
 

@@ -12,7 +12,8 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import JsonOption
-from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
+from servobench.harness.cli.terminal import console, print_json, say, writing
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
@@ -44,8 +45,8 @@ def controllers(
     """List the controllers, or show the settings of one."""
     from servobench.controllers.parts import ESTIMATORS, LAWS
     from servobench.harness.batch.trials import choose
-    from servobench.harness.config.defaults import default_config
     from servobench.harness.config.registry import find_controller
+    from servobench.harness.config.settings import default_config
 
     if name:
         name = choose("controller", name)
@@ -59,9 +60,7 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=options.TASK.complete)] = None,
-    robot: Annotated[
-        str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
-    ] = DEFAULT_ROBOT,
+    robot: Annotated[str, options.option(options.ROBOT._replace(check=None), options.ROBOT_WORDS)] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
@@ -72,7 +71,7 @@ def tasks(
         name = choose_task(name)
         _show_settings(name, fitted(name, find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
-        refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
+        raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
         _show_names([_described(name, find_task(name).summary) for name in task_names()], as_json=as_json)
 
@@ -126,7 +125,7 @@ def init(
         sys.stdout.write(text)
         return
     if file.exists():
-        refuse(f"{file} exists already and is left as it is; name another file")
+        raise ConfigurationError(f"{file} exists already and is left as it is; name another file")
     with writing(file), file.open("x", encoding="utf-8") as new:
         new.write(text)
     say(f"{file}: {', '.join(sections)}")

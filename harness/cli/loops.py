@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import option
-from servobench.harness.cli.terminal import console, print_tables, refuse, say, writing
+from servobench.harness.cli.options import named_option, option
+from servobench.harness.cli.terminal import console, print_tables, say, writing
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from servobench.harness.analysis.loops.equilibrium import Source
     from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.resolution import ResolvedRun
@@ -26,21 +26,23 @@ def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
     *,
     mismatch: options.MismatchOption = "none",
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
+    seed: Annotated[int, option("INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
+        Literal["true", "nominal", "estimated"],
+        option("NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
     ] = "true",
     identify: Annotated[
         bool,
-        option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
+        named_option(
+            "--identify", "", "Identify all loops from logged small motions, while estimators go on learning."
+        ),
     ] = False,
     simulate: Annotated[
-        bool, option("--simulate", "", "Also find the limits of gain and latency by simulation.")
+        bool, named_option("--simulate", "", "Also find the limits of gain and latency by simulation.")
     ] = False,
     overrides: options.Overrides,
-    out: Annotated[Path, option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
-    / "analyse",
+    out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results") / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
 
@@ -48,19 +50,17 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.contract.faults import RunFault
 
-    source = _source(jacobian)
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
         with console.status(f"analysing {run.request.controller}"):
             try:
-                loops.append(analyse_loop(run, source, identify=identify))
+                loops.append(analyse_loop(run, jacobian, identify=identify))
             except RunFault as fault:
                 say(f"{run.request.controller}: {fault}")
     if not loops:
-        refuse("no loop is left to analyse")
+        raise ConfigurationError("no loop is left to analyse")
     table = loop_table(loops)
     if simulate:
         chosen = {run.request.controller: run for run in runs}
@@ -71,20 +71,9 @@ def analyse(
         table.to_csv(out / TABLE, index=False)
     text = printed(table)
     page = write_pictures(out, loops, text, LEGEND)[0]
-    title = f"Loops at rest, estimators frozen at the {source} Jacobian"
+    title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
     print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
     say(f"table in {out / TABLE}, pictures in {page}")
-
-
-def _source(jacobian: str) -> Source:
-    from servobench.harness.analysis.loops.equilibrium import SOURCES
-    from servobench.plant.contract.settings import did_you_mean
-
-    known = [source for source in SOURCES if source == jacobian]
-    if not known:
-        hint = did_you_mean(jacobian, SOURCES)
-        refuse(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
-    return known[0]
 
 
 def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:

@@ -21,6 +21,7 @@ from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
+from servobench.plant.contract.faults import ConfigurationError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
 HELP_NAMES: Final = ["-h", "--help"]
@@ -155,7 +156,6 @@ def _line_of_system(error: OSError) -> str | None:
 def _line_for_user(error: ValueError | ImportError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
-    from servobench.plant.contract.faults import ConfigurationError
 
     if isinstance(error, ImportError):
         return missing_extra(error, "this command")

@@ -1,6 +1,6 @@
 """Options of the command line, each declared once, and commands made of them.
 
-The type of a parameter declares its option: `seed: Annotated[int, option("--seed", "INTEGER", "Seed of the run.")]`.
+The type of a parameter declares its option: `seed: Annotated[int, option("INTEGER", "Seed of the run.")]`.
 Help pages, completion by shells, checks and the table in docs/commands.md are made from this one row. A parameter whose
 type is a dataclass stands for its fields, each of which is an option.
 """
@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, get_type_hi
 
 import typer
 
+from servobench.harness.batch.processes import Bounds, read_size
 from servobench.harness.cli import selection
-from servobench.harness.cli.terminal import refuse
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.plan import Batch
-    from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
 ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
@@ -48,17 +48,18 @@ ROBOT, SENSING = (
 )
 
 
-def option(
+def named_option(
     name: str,
     value: Value | str,
     words: str,
     absent: Mapping[str, str] | None = None,
     **further: Any,  # noqa: ANN401 - any argument of typer.Option
 ) -> Any:  # noqa: ANN401 - typer's own word for it
-    """Declare an option.
+    """Declare an option whose name is not that of its parameter.
 
     Args:
-        name: with its dashes; `--on/--off` for a switch with two names, `--output -o` for a short one.
+        name: with its dashes; `--on/--off` for a switch with two names, `--output -o` for a short one; empty for the
+            name of the parameter.
         value: kind of its value, or only the word for it; empty for a switch.
         words: meaning, for help pages; unit in brackets.
         absent: command without this option -> the reason.
@@ -76,7 +77,9 @@ def option(
     )  # fmt: skip
 
 
-execution_option = partial(option, rich_help_panel="Execution")  # of workers, limits and resuming
+EXECUTION: Final = "Execution"  # panel of workers, limits and resuming
+option = partial(named_option, "")  # called as its parameter
+execution_option = partial(option, rich_help_panel=EXECUTION)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -114,7 +117,7 @@ LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
 ROBOT_WORDS = "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf."
 RobotOption = Annotated[
     str,
-    option(
+    named_option(
         "--robot",
         ROBOT,
         ROBOT_WORDS,
@@ -126,7 +129,7 @@ RobotOption = Annotated[
 ]
 SensingOption = Annotated[
     str,
-    option(
+    named_option(
         "--sensing",
         SENSING,
         "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
@@ -140,22 +143,24 @@ SensingOption = Annotated[
         },
     ),
 ]
-PlantsOption = Annotated[str, option("--plants", PLANT.several(), LISTED.format("plants"))]
-ControllersOption = Annotated[str, option("--controllers", CONTROLLER.several(), LISTED.format("controllers"))]
-TasksOption = Annotated[
-    str, option("--tasks", TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
+PlantsOption = Annotated[str, option(PLANT.several(), LISTED.format("plants"))]
+ControllersOption = Annotated[str, option(CONTROLLER.several(), LISTED.format("controllers"))]
+TasksOption = Annotated[str, option(TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")]
+TaskOption = Annotated[str, option(TASK, "Name of the task; servobench tasks lists them.")]
+MismatchOption = Annotated[str, option(MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")]
+SeedsOption = Annotated[str, option("SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
+FolderOption = Annotated[
+    Path, named_option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")
 ]
-TaskOption = Annotated[str, option("--task", TASK, "Name of the task; servobench tasks lists them.")]
-MismatchOption = Annotated[
-    str, option("--mismatch", MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
+RunIdOption = Annotated[
+    str | None, named_option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")
 ]
-SeedsOption = Annotated[str, option("--seeds", "SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
-FolderOption = Annotated[Path, option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")]
-RunIdOption = Annotated[str | None, option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")]
-JsonOption = Annotated[bool, option("--json", "", "Print JSON, for other programs.")]
+JsonOption = Annotated[bool, named_option("--json", "", "Print JSON, for other programs.")]
 DebugOption = Annotated[
     bool,
-    execution_option("--debug", "", "Run in this process, and stop at the first crash with its trace."),
+    named_option(
+        "--debug", "", "Run in this process, and stop at the first crash with its trace.", rich_help_panel=EXECUTION
+    ),
 ]
 
 
@@ -166,12 +171,11 @@ class Combinations:
     plants: PlantsOption = "kinematic"
     controllers: ControllersOption = "all"
     tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
-    mismatch: Annotated[str, option("--mismatch", MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
+    mismatch: Annotated[str, option(MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
     robot: RobotOption = "ur5"
     sensing: Annotated[
         str,
         option(
-            "--sensing",
             SENSING.several(),
             "Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the hand.",
         ),
@@ -204,16 +208,12 @@ class Limited:
     run_timeout: Annotated[
         float | None,
         execution_option(
-            "--run-timeout",
-            "SECONDS",
-            "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
-            min=0.001,
+            "SECONDS", "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.", min=0.001
         ),
     ] = None
     run_memory: Annotated[
         str | None,
         execution_option(
-            "--run-memory",
             "SIZE",
             "Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
             "servobench's.",
@@ -221,8 +221,11 @@ class Limited:
     ] = None
     isolate: Annotated[
         bool,
-        execution_option(
-            "--isolate/--no-isolate", "", "Keep plug-ins and foreign FMUs in processes of their own, with limits."
+        named_option(
+            "--isolate/--no-isolate",
+            "",
+            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
+            rich_help_panel=EXECUTION,
         ),
     ] = True
 
@@ -232,12 +235,10 @@ class Limited:
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
-        from servobench.harness.batch.processes import Bounds, read_size
-
         try:
             memory = None if self.run_memory is None else read_size(self.run_memory)
         except ValueError as error:
-            refuse(f"--run-memory: {error}")
+            raise ConfigurationError(f"--run-memory: {error}") from error
         return Bounds(self.run_timeout, memory, self.isolate)
 
 
@@ -246,12 +247,10 @@ class Place(Limited):
     """Processors or cluster that carry runs out."""
 
     workers: Annotated[
-        int | None,
-        execution_option("--workers", "COUNT", "Worker processes; default: one for each processor.", min=1),
+        int | None, execution_option("COUNT", "Worker processes; default: one for each processor.", min=1)
     ] = None
     scheduler: Annotated[
-        str | None,
-        execution_option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent."),
+        str | None, execution_option("ADDRESS", "Address of a Dask scheduler to which runs are sent.")
     ] = None
 
 
@@ -259,15 +258,16 @@ class Place(Limited):
 class Running(Place):
     """Execution of runs that can be resumed."""
 
-    resume: Annotated[bool, execution_option("--resume", "", "Continue in a folder whose runs were interrupted.")] = (
-        False
-    )
+    resume: Annotated[
+        bool,
+        named_option("--resume", "", "Continue in a folder whose runs were interrupted.", rich_help_panel=EXECUTION),
+    ] = False
 
-    def execution(self, observer: Observer | None = None) -> Execution:
+    def execution(self) -> Execution:
         """Return it as the driver takes it."""
-        from servobench.harness.batch.campaign import Execution, Observer
+        from servobench.harness.batch.campaign import Execution
 
-        return Execution(self.workers, self.scheduler, self.bounds(), self.resume, observer or Observer())
+        return Execution(self.workers, self.scheduler, self.bounds(), self.resume)
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,9 @@ class Judging:
     """Treatment of runs that fail."""
 
     debug: DebugOption = False
-    strict: Annotated[bool, execution_option("--strict", "", "End with exit code 1 if a run failed.")] = False
+    strict: Annotated[
+        bool, named_option("--strict", "", "End with exit code 1 if a run failed.", rich_help_panel=EXECUTION)
+    ] = False
 
     def execution(self, running: Running) -> Execution:
         """Return the execution of runs; one by one in this process if they are debugged.
@@ -294,7 +296,7 @@ class Judging:
         }
         for option, value in given.items():
             if value:
-                refuse(f"--debug carries runs out one by one in this process; leave {option} away")
+                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
         return replace(how, workers=1, debug=True)
 
 
@@ -303,12 +305,10 @@ class Overrides:
     """Settings that a user gives."""
 
     set_: Annotated[
-        list[str] | None,
-        option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."),
+        list[str] | None, named_option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated.")
     ] = None
     config: Annotated[
-        Path | None,
-        option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task."),
+        Path | None, option("FILE", "TOML file with settings; a [section] for each plant, controller or task.")
     ] = None
 
     def settings(self, *further: str) -> Settings:

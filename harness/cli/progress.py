@@ -6,6 +6,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from servobench.harness.batch.campaign import Observer, Row
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Execution, Observer, Row
 from servobench.harness.cli.terminal import INTERRUPTED
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
@@ -116,12 +118,16 @@ class ConsoleObserver(Observer):
     Args:
         console: where.
         bar: false where a debugger may need the terminal.
+
+    Attributes:
+        done: finished runs.
+        total: all runs.
     """
 
     def __init__(self, console: Console, *, bar: bool = True) -> None:
         self._console, self._shows_bar, self._shown = console, bar, contextlib.ExitStack()
         self._tell = self._shown.enter_context(telling(console, "checking the configuration"))
-        self._done = self._total = 0
+        self.done = self.total = 0
 
     def training(self, share: float, subject: str) -> None:
         """Show how much of a training of networks is done."""
@@ -130,14 +136,21 @@ class ConsoleObserver(Observer):
     def begin(self, total: int, done: int) -> None:
         """Show the bar."""
         self.close()
-        self._done, self._total = done, total
+        self.done, self.total = done, total
         self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
         self._bar = self._bars.begin("running", total, done)
+        self._end()
 
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
-        self._done += len(rows)
-        self._bars.reach(self._bar, self._done, f"{self._done} of {self._total} runs")
+        self.done += len(rows)
+        self._bars.reach(self._bar, self.done, f"{self.done} of {self.total} runs")
+        self._end()
+
+    def _end(self) -> None:
+        """Take the bar away after the last run."""
+        if self.done == self.total:
+            self.close()
 
     def note(self, text: str) -> None:
         """Print a line."""
@@ -149,24 +162,24 @@ class ConsoleObserver(Observer):
 
 
 @contextlib.contextmanager
-def watching(console: Console, folder: Path, *, bar: bool = True) -> Iterator[Observer]:
-    """Yield an observer for one campaign; after Ctrl-C one line says how to continue.
+def watching(console: Console, folder: Path, how: Execution) -> Iterator[Execution]:
+    """Yield how runs are carried out, with their progress shown; after Ctrl-C a line says how to go on.
 
     Args:
         console: where it shows the progress.
         folder: the folder of --out.
-        bar: see `ConsoleObserver`.
+        how: how runs are carried out.
     """
-    observer = ConsoleObserver(console, bar=bar)
+    observer = ConsoleObserver(console, bar=not how.debug)
     try:
-        yield observer
+        yield replace(how, observer=observer)
     except KeyboardInterrupt:
         observer.close()
-        if folder.exists():
-            sys.stderr.write(
-                f"servobench: interrupted; finished runs are kept in {folder}, the same call with --resume continues\n"
-            )
-            raise SystemExit(INTERRUPTED) from None
-        raise
+        if not any(folder.rglob("*.parquet")):
+            raise
+        done = max(observer.done, sum(map(len, results.finished_runs(folder))))  # a last one may be untold
+        kept = f"{done} of {observer.total} runs were finished and kept in {folder}"
+        sys.stderr.write(f"servobench: interrupted: {kept}; the same call with --resume and this --out continues\n")
+        raise SystemExit(INTERRUPTED) from None
     finally:
         observer.close()

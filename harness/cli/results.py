@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli.options import JsonOption, option
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, refuse, say
+from servobench.harness.cli.options import JsonOption, named_option, option
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,20 +27,15 @@ def statistics(
     metric: Annotated[
         str | None,
         option(
-            "--metric",
             "COLUMN",
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
     never: Annotated[
         float | None,
-        option(
-            "--never",
-            "NUMBER",
-            "Value for a run that has none, such as one that never settled; default: twice the largest.",
-        ),
+        option("NUMBER", "Value for a run that has none, such as one that never settled; default: twice the largest."),
     ] = None,
-    markdown: Annotated[bool, option("--markdown", "", "Print the tables as Markdown.")] = False,
+    markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Judge the controllers of a folder, with 95 % intervals.
@@ -50,7 +46,7 @@ def statistics(
     from servobench.harness.batch import results
 
     if markdown and as_json:
-        refuse("--markdown and --json are two ways to print the same; give one of them")
+        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
@@ -70,7 +66,7 @@ def statistics(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    out: Annotated[Path | None, option("--out", "FILE", "The page; default: report.html in the folder.")] = None,
+    out: Annotated[Path | None, option("FILE", "The page; default: report.html in the folder.")] = None,
 ) -> None:
     """Write one page about a results folder.
 
@@ -129,9 +125,9 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
 
 def export(
     folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
-    out: Annotated[Path, option("--out", "FOLDER", "New folder for the files.")],
+    out: Annotated[Path, option("FOLDER", "New folder for the files.")],
     format_: Annotated[
-        str, option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
+        str, named_option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
     ] = "csv",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""

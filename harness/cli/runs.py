@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import INTERRUPTED, console, print_rows, print_tables, refuse, say
+from servobench.harness.cli.terminal import console, print_rows, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import point_latest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import pandas as pd
 
     from servobench.harness.batch.campaign import Campaign, Execution
@@ -26,49 +23,39 @@ if TYPE_CHECKING:
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
 OutOption = Annotated[
-    Path | None, option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
+    Path | None, named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
 ]
-ReportOption = Annotated[bool, option("--report/--no-report", "", "Also make the page report.html.")]
+ReportOption = Annotated[bool, named_option("--report/--no-report", "", "Also make the page report.html.")]
 
 
 def run(
     method: Annotated[
         str | None,
         typer.Argument(
-            metavar="CONTROLLER",
-            help="Short for --controller.",
-            show_default=False,
-            autocompletion=CONTROLLER.complete,
+            metavar="CONTROLLER", help="Short for --controller.", show_default=False, autocompletion=CONTROLLER.complete
         ),
     ] = None,
     *,
     plant: Annotated[
         str | None,
         option(
-            "--plant",
-            PLANT,
-            "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
+            PLANT, "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed."
         ),
     ] = None,
     controller: Annotated[
         str | None,
         option(
-            "--controller",
-            CONTROLLER,
-            f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
+            CONTROLLER, f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}."
         ),
     ] = None,
-    estimator: Annotated[
-        str | None,
-        option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
-    ] = None,
+    estimator: Annotated[str | None, option(ESTIMATOR, "Compose the law --controller with this estimator.")] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    seed: Annotated[int, option("--seed", "INTEGER", "Seed of everything random in the run.")] = 0,
+    seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,
     overrides: options.Overrides,
-    view: Annotated[bool, option("--view", "", "Watch the bullet plant in a window.")] = False,
+    view: Annotated[bool, named_option("--view", "", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
     limited: options.Limited,
@@ -83,11 +70,11 @@ def run(
     from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
-        refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
+        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     plant = _default_plant() if plant is None else plant
     plant = selection.choose("plants", plant)
     if view and plant != "bullet":
-        refuse(f"--view shows the plant bullet only, got --plant {plant}")
+        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.choose("controllers", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
@@ -121,17 +108,14 @@ def compare(
 
     batch = combinations.batch()
     if running.resume and out is None:
-        refuse("--resume needs --out, the folder to continue in")
+        raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
     _carry_out(campaign, out, judging.execution(running), with_report=with_report, strict=judging.strict)
 
 
 def train(
     *,
-    controller: Annotated[
-        str,
-        option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
-    ] = "rbfnn_mfac",
+    controller: Annotated[str, option(CONTROLLER, "Name of the controller whose networks to train.")] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     overrides: options.Overrides,
@@ -158,32 +142,14 @@ def train(
     say(f"kept in {cache_folder(NETWORKS)}")
 
 
-@contextlib.contextmanager
-def _ending_at_once(folder: Path, wanted: int) -> Iterator[None]:
-    """End at Ctrl-C, also while something is drawn, with a line that says how to go on if runs were finished."""
-    from servobench.harness.batch import results
-
-    try:
-        yield
-    except KeyboardInterrupt:
-        whole = (folder / results.RUNS).is_file()
-        count = wanted if whole else sum(map(len, results.finished_runs(folder))) if folder.exists() else 0
-        if not count:
-            raise
-        line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
-        say(line + "the same call with --resume and this --out continues")
-        sys.exit(INTERRUPTED)
-
-
 def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool, strict: bool) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.batch.campaign import carry_out
-    from servobench.harness.cli.progress import ConsoleObserver
+    from servobench.harness.cli.progress import watching
 
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    with _ending_at_once(folder, len(campaign.cells)):
-        with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
-            carry_out(campaign, folder, replace(how, observer=observer))
+    with watching(console, folder, how) as watched:
+        carry_out(campaign, folder, watched)
         runs = _show(folder, latest=out is None, with_report=with_report)
     judge(folder, [runs], strict=strict)
 
@@ -194,8 +160,6 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
     from servobench.harness.pictures.figures import draw_figures
-    from servobench.plant.contract.faults import ConfigurationError
-    from servobench.plant.contract.files import point_latest
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))

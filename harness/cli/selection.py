@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from servobench.harness.cli.terminal import refuse, say
+from servobench.harness.cli.terminal import say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
@@ -166,10 +167,10 @@ def split_names(
         else:
             names.append(_chosen(find, word))
     if not names:
-        refuse(f"--{option} is empty; valid: {', '.join(known)}")
+        raise ConfigurationError(f"--{option} is empty; valid: {', '.join(known)}")
     for name in names:
         if names.count(name) > 1:
-            refuse(f"--{option} names {name} twice")
+            raise ConfigurationError(f"--{option} names {name} twice")
     return tuple(names)
 
 

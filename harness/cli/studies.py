@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, PLANT, option
+from servobench.harness.cli.options import CONTROLLER, PLANT, named_option, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, refuse, say
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, say
+from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -29,15 +29,11 @@ def sweep(
     combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        option(
-            "--vary",
-            "KEY=VALUES",
-            "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05.",
-        ),
+        option("KEY=VALUES", "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05."),
     ] = None,
-    noise: Annotated[str, option("--noise", "NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
-    latency: Annotated[str, option("--latency", "SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
-    period: Annotated[str, option("--period", "SECONDS", "Control periods [s]: --vary period=...")] = "",
+    noise: Annotated[str, option("NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
+    latency: Annotated[str, option("SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
+    period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
     running: options.Running,
     overrides: options.Overrides,
     judging: options.Judging,
@@ -56,9 +52,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    how = judging.execution(running)
-    with watching(console, out, bar=not how.debug) as observer:
-        carry_out(campaign, out, replace(how, observer=observer))
+    with watching(console, out, judging.execution(running)) as how:
+        carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
@@ -69,14 +64,13 @@ def sweep(
 def robustness(
     *,
     out: options.FolderOption,
-    plant: Annotated[str, option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
+    plant: Annotated[str, option(PLANT, "Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
-        str,
-        option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
+        str, option("NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -87,15 +81,15 @@ def robustness(
     """
     from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.robustness import find_lines, make_map
+    from servobench.harness.studies.robustness import batch_of_map, find_lines, make_map
 
     settings = overrides.settings()
     lines = find_lines(selection.split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
-    with watching(console, out) as observer:
-        how = running.execution(observer)
-        files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
+    batch = batch_of_map(where, names, parse_seeds(seeds), robot, sensing)
+    with watching(console, out, running.execution()) as how:
+        files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")
 
 
@@ -103,17 +97,14 @@ def claims(
     *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[int, option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
+    seeds: Annotated[int, option("COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
-        str,
-        option(
-            "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
-        ),
+        Literal["equipped", "published", "both"],
+        option("NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."),
     ] = "both",
     running: options.Running,
     check: Annotated[
-        Path | None,
-        option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
+        Path | None, option("FILE", "Table of answers that must come out the same; the exit code is 1 if they differ.")
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -121,7 +112,7 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.claims import find_divisions
+    from servobench.harness.studies.claims import DIVISIONS
     from servobench.harness.studies.reproduction import (
         ANSWERS,
         FIGURES,
@@ -132,10 +123,10 @@ def claims(
     )
 
     names = selection.split("plants", plants)
-    divisions = find_divisions(division)
+    divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
     wanted = None if check is None else read_answers(check)
-    with watching(console, out) as observer:
-        answers = reproduce(out, names, seeds, running.execution(observer), divisions)
+    with watching(console, out, running.execution()) as how:
+        answers = reproduce(out, names, seeds, how, divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
         verdict = answer.verdict + elsewhere(answer, answers)
@@ -152,31 +143,29 @@ def claims(
 def tune(
     *,
     controllers: Annotated[
-        str,
-        option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
+        str, option(CONTROLLER.several(), "Comma-separated names, or all that have a search space.")
     ] = "all",
     studies: Annotated[
-        int,
-        option(
-            "--studies", "COUNT", "Studies of each method; the one that is best on a second set of robots is taken."
-        ),
+        int, option("COUNT", "Studies of each method; the one that is best on a second set of robots is taken.")
     ] = 3,
-    trials: Annotated[int, option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
+    trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
+        int, option("COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[
-        int, option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
+        int, option("INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
     ] = 0,
-    study_seed: Annotated[int, option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
+    study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
         bool,
-        option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
+        named_option(
+            "--check", "", "Change each tuned value in use one by one instead, and name changes that are better."
+        ),
     ] = False,
-    out: Annotated[Path, option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
+    out: Annotated[Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
@@ -195,7 +184,7 @@ def tune(
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
-        refuse(str(error))
+        raise ConfigurationError(str(error)) from error
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):

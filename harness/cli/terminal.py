@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
 
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import reason
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -30,26 +33,13 @@ GAP = 2  # [characters] that a table needs for each column beside its cells
 console = Console()
 
 
-def refuse(line: str) -> NoReturn:
-    """End the command because of a bad input: one line on standard error and exit code 2.
-
-    Raises:
-        ConfigurationError: always; `main` prints its line.
-    """
-    from servobench.plant.contract.faults import ConfigurationError
-
-    raise ConfigurationError(line)
-
-
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Refuse a file or a folder that cannot be written within the context."""
-    from servobench.plant.contract.files import reason
-
     try:
         yield
     except OSError as error:
-        refuse(f"{error.filename or path} cannot be written: {reason(error)}")
+        raise ConfigurationError(f"{error.filename or path} cannot be written: {reason(error)}") from error
 
 
 @contextlib.contextmanager

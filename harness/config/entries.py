@@ -76,24 +76,12 @@ class Guarded:
         except (RunFault, ConfigurationError):
             raise
         except (Exception, SystemExit) as error:
-            raise ConfigurationError(describe_at(error, folder_of(self.make))) from error
+            raise ConfigurationError(describe_at(error)) from error
         if self.kind is not None and not isinstance(made, self.kind):
             raise ConfigurationError(f"it is built as {type(made).__name__}, wanted a servobench.{self.kind.__name__}")
         if isinstance(made, Plant):
             _check_spec(made)
         return made
-
-
-def folder_of(code: object) -> Path:
-    """Return the folder of the file that holds a class, a function or an object's class; that of none is the root."""
-    if isinstance(code, Guarded):
-        return folder_of(code.make)
-    if isinstance(code, partial):
-        return folder_of(code.args[0] if code.func in (copy_of, on_bench) else code.func)
-    try:
-        return Path(inspect.getfile(code if isinstance(code, type) or inspect.isroutine(code) else type(code))).parent
-    except (TypeError, OSError):
-        return Path.cwd()
 
 
 def copy_of(original: Controller, _knowledge: RobotKnowledge) -> Controller:
@@ -325,7 +313,7 @@ def check_settings(config: Callable[[], Any], place: str) -> None:
     try:
         made = config()
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(describe_at(error, folder_of(config)) or f"{where}: {error}") from error
+        raise ConfigurationError(describe_at(error) or f"{where}: {error}") from error
     if isinstance(made, type) or not is_dataclass(made):
         remedy = f"put @dataclass(frozen=True) above class {name}" if isinstance(config, type) else "return a dataclass"
         raise ConfigurationError(f"{where}: the settings {name} are no dataclass; {remedy}")
@@ -361,7 +349,7 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
     try:
         config = get_type_hints(kind.__init__).get(needed[0].name)
     except Exception as error:  # annotations are code of the user
-        raise ConfigurationError(f"{wanted}; {describe_at(error, folder_of(kind))}") from error
+        raise ConfigurationError(f"{wanted}; {describe_at(error)}") from error
     if not isinstance(config, type):
         raise ConfigurationError(wanted)
     return config

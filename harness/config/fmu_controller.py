@@ -13,8 +13,7 @@ are written, a step of one period is taken, and the outputs are read.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, final
 
@@ -26,13 +25,14 @@ from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import File, Names, Positive, Values, nested, override, settings
+from servobench.plant.contract.settings import File, Names, Positive, Values, nested, settings
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.description import FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.library import InstanceOptions
+from servobench.plant.fmu.mapping import make_mapping
 from servobench.plant.fmu.world import STRUCTURAL, setter, structural_sizes
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -103,8 +103,8 @@ class FmuController(Controller):
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)
-        self._inputs = Port(self._select("inputs", [name for names in roles for name in names]))
-        self._outputs = Port(self._select("outputs", (*mapping.outputs, *mapping.jacobian)))
+        self._inputs = Port(self._description.select([name for names in roles for name in names], "inputs", NUMERIC))
+        self._outputs = Port(self._description.select((*mapping.outputs, *mapping.jacobian), "outputs", NUMERIC))
         self._write, self._read = self._instance.writer(self._inputs), self._instance.reader(self._outputs)
         self._advance = self._instance.stepper(self._period)
         self._fresh = True
@@ -112,16 +112,17 @@ class FmuController(Controller):
     def _check(self, mapping: ControllerMapping, preview: int) -> int:
         """Return how many rows of the reference it takes, and refuse sizes that do not fit."""
         (m, n), file = self._shape, self._description.path.name
+        roles = ("outputs", "features", "joints", "seen", "jacobian", "reference")
+        found = {role: self._description.select(getattr(mapping, role), role, NUMERIC) for role in roles}
         for role, size in (("outputs", n), ("features", m), ("joints", n), ("seen", m), ("jacobian", m * n)):
-            names: Names = getattr(mapping, role)
-            came = total_size(self._select(role, names))
-            if names and came != size:
+            came = total_size(found[role])
+            if found[role] and came != size:
                 raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
         for role in ("joints", "features", "seen", "reference"):
-            for variable in self._select(role, getattr(mapping, role)):
+            for variable in found[role]:
                 if variable.causality != "input":
                     raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
-        came = total_size(self._select("reference", mapping.reference))
+        came = total_size(found["reference"])
         rows, rest = divmod(came, m)
         if rest or rows > 1 + preview:
             raise ValueError(
@@ -129,9 +130,6 @@ class FmuController(Controller):
                 "run.preview_time says how far it reaches"
             )
         return rows
-
-    def _select(self, role: str, names: Sequence[str]) -> tuple[Variable, ...]:
-        return tuple(variable for name in names for variable in self._description.find(name, role, NUMERIC))
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Go through initialisation again; nothing here is random.
@@ -200,7 +198,11 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
     Raises:
         ValueError: the mapping cannot be used.
     """
-    mapping = _conventional(path) if path.suffix == ".fmu" else read_controller_mapping(path)
+    if path.suffix == ".fmu":
+        mapping, how = _conventional(path), "by the names of exported controllers"
+    else:
+        mapping = make_mapping(ControllerMapping, path, read_toml("mapping", path))
+        how = f"as mapped by {path.name}"
 
     def build(config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
         del config
@@ -209,23 +211,7 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
         except FmuError as error:
             raise ValueError(str(error)) from error
 
-    how = "by the names of exported controllers" if path.suffix == ".fmu" else f"as mapped by {path.name}"
     return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, build)
-
-
-def read_controller_mapping(path: Path) -> ControllerMapping:
-    """Read a mapping from a TOML file.
-
-    Raises:
-        ValueError: an unreadable or malformed file, an unknown key, or a value of the wrong kind.
-    """
-    table = read_toml("mapping", path)
-    for key in ("file", "outputs", "features", "reference"):
-        if key not in table:
-            raise ValueError(f"mapping {path}: the key {key!r} is missing")
-    given = ("to be given",)
-    mapping = override(f"mapping {path}", ControllerMapping(path, given, given, given), table)
-    return replace(mapping, file=path.parent / mapping.file)
 
 
 def _conventional(path: Path) -> ControllerMapping:
@@ -242,7 +228,7 @@ def _conventional(path: Path) -> ControllerMapping:
             f"{path.name} has no {', '.join(lacking)}, as exported controllers have; write a mapping of its names, "
             f"such as {path.stem}.toml"
         )
-    return override(f"mapping {path}", ControllerMapping(path, (" ",), (" ",), (" ",)), names)
+    return make_mapping(ControllerMapping, path, {"file": path.name, **names})
 
 
 def _has(description: FmuDescription, name: str) -> bool:

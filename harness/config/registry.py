@@ -20,7 +20,7 @@ from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, Own, own_object, read_own
 from servobench.harness.config.installation import check_installed, has_no_wheel
-from servobench.harness.config.source import describe_import, is_place
+from servobench.harness.config.source import describe_at, is_place
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
@@ -191,8 +191,7 @@ def _load(registry: Registry[Any], name: str) -> Any:  # noqa: ANN401 - an entry
     try:
         given = point.load()
     except (Exception, SystemExit) as error:
-        why = describe_import(error, point.module)
-        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error
+        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {describe_at(error)}") from error
     if own is not None:
         return given
     try:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import hashlib
 import importlib
 import importlib.util
 import re
+import site
 import sys
+import sysconfig
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Final, TypeAlias
@@ -27,7 +29,8 @@ PLACE: Final = re.compile(
     r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
 )
 PACKAGE = "servobench"
-PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file
+ENGINE: Final = Path(__file__).parents[2]  # folder of this package
+NAMED: Final[set[str]] = set()  # top-level modules that users named
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class SourceFile:
         except BaseException as error:
             del sys.modules[name]
             if isinstance(error, Exception | SystemExit):
-                raise ConfigurationError(describe_at(error, self.path.parent)) from error
+                raise ConfigurationError(describe_at(error)) from error
             raise
         return module
 
@@ -132,39 +135,53 @@ def make_importable(folder: Path) -> None:
         sys.path.append(str(folder))
 
 
-def describe_at(error: BaseException, folder: Path) -> str:
-    """Return an error as one line, `FILE:LINE: KIND: MESSAGE`, with the last place in code of the user.
-
-    Args:
-        error: as it was raised.
-        folder: that of the user's code.
-    """
+def describe_at(error: BaseException) -> str:
+    """Return an error as one line, `FILE:LINE: KIND: MESSAGE`, with the last place in code of users."""
     if isinstance(error, SyntaxError) and error.filename:
         place, message = f"{show(Path(error.filename))}:{error.lineno}: ", error.msg
     else:
-        found = place_of(error, folder)
-        place, message = f"{found}: " if found else "", str(error)
+        frames = reversed(traceback.extract_tb(error.__traceback__))
+        place, message = _first_place((frame.filename, frame.lineno) for frame in frames), str(error)
     return place + " ".join(f"{type(error).__name__}: {message}".split()).rstrip(":")
 
 
-def place_of(error: BaseException, folder: Path) -> str:
-    """Return `FILE:LINE` of the last place below `folder` at which an error was raised or passed on; "" if none."""
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        path = Path(frame.filename)
-        if is_below(path, folder):
-            return f"{show(path)}:{frame.lineno}"
-    return ""
+def place_in_trace(trace: str) -> str:
+    """Return `FILE:LINE: ` of the innermost line of users in a trace of `faulthandler`; "" if there is none."""
+    return _first_place(re.findall(r'File "(.+?)", line (\d+)', trace))
 
 
-def place_in_trace(trace: str, is_users: Callable[[Path], bool]) -> str:
-    """Return `FILE:LINE: ` of the innermost line of the user in a trace of `faulthandler`; "" if there is none."""
-    places = ((Path(file), line) for file, line in re.findall(r'File "(.+?)", line (\d+)', trace))
-    return next((f"{show(path)}:{line}: " for path, line in places if is_users(path)), "")
+def _first_place(places: Iterable[tuple[str, object]]) -> str:
+    return next((f"{show(Path(file))}:{line}: " for file, line in places if is_users(file)), "")
 
 
-def is_below(path: Path, folder: Path) -> bool:
-    """Return whether a file lies below a folder, and is none of another package that is installed there."""
-    return path.is_relative_to(folder) and PACKAGES not in path.relative_to(folder).parts
+def is_users(file: str) -> bool:
+    """Return whether a file is code of users: a script, a cell of a notebook, a plug-in or a module that they named.
+
+    The files of this package, of the standard library and of other installed packages are not.
+    """
+    if file.startswith("<"):
+        return file.startswith("<ipython")
+    path = Path(file)
+    folders = [folder for folder in _libraries() if path.is_relative_to(folder)]
+    if path.is_relative_to(ENGINE) or not folders:
+        return not path.is_relative_to(ENGINE)
+    package = path.relative_to(max(folders, key=len)).parts[0].removesuffix(".py")
+    return package in NAMED or package in _plugin_packages()
+
+
+@cache
+def _plugin_packages() -> frozenset[str]:
+    """Return the top-level packages of other distributions that publish something for this package."""
+    groups = (group for group in entry_points().groups if group.startswith(f"{PACKAGE}."))
+    points = (point for group in groups for point in entry_points(group=group))
+    return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
+
+
+@cache
+def _libraries() -> tuple[str, ...]:
+    """Return the folders of the standard library and of installed packages."""
+    paths = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    return *paths, *site.getsitepackages(), site.getusersitepackages()
 
 
 def show(path: Path) -> str:
@@ -196,29 +213,17 @@ def import_user_module(module: str) -> ModuleType:
         ConfigurationError: it cannot be imported; one line with the place in it.
     """
     make_importable(Path.cwd())
+    NAMED.add(module.partition(".")[0])
     try:
         return importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(describe_import(error, module)) from error
-
-
-def describe_import(error: BaseException, module: str) -> str:
-    """Return why a module cannot be imported, as one line with the place in it where there is one."""
-    return describe_at(error, folder_of_module(module))
+        raise ConfigurationError(describe_at(error)) from error
 
 
 def digest_of_module(module: str) -> str:
     """Return the SHA-256 of the file of a module that is imported; empty where it has none."""
     file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-
-
-def folder_of_module(module: str) -> Path:
-    """Return the folder of the top-level package of a module, or of a module without one; else the present folder."""
-    spec = None
-    with contextlib.suppress(ImportError, ValueError):
-        spec = importlib.util.find_spec(module.partition(".")[0])
-    return Path(spec.origin).parent if spec is not None and spec.has_location and spec.origin else Path.cwd()
 
 
 def neighbours(file: Path, root: Path) -> list[Path]:

@@ -33,20 +33,6 @@ PLACEHOLDER: Final = "constant"  # the harness builds every run with a controlle
 MARK: Final = (40, 40, 40)  # red, green, blue
 
 
-def resolve_environment(
-    plant: str, task: str, mismatch: str, robot: str, sensing: str, settings: Mapping[str, Mapping[str, Any]] | None
-) -> ResolvedRun:
-    """Return the resolved run of an environment, with seed 0; arguments as in `ServoEnv`.
-
-    Raises:
-        ConfigurationError: a name, setting or mismatch that cannot be used.
-    """
-    request = RunRequest(plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing)
-    given = Settings({} if settings is None else settings)
-    check_settings(given, [plant, task])
-    return resolve(request, given)
-
-
 def check_options(options: object) -> None:
     """Raise a `ConfigurationError` if `reset` is given options: there are none."""
     if options not in (None, {}):
@@ -99,7 +85,10 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         self.render_mode = render_mode
-        self.resolved: Final = resolve_environment(plant, task, mismatch, robot, sensing, settings)
+        request = RunRequest(plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing)
+        given = Settings({} if settings is None else settings)
+        check_settings(given, [plant, task])
+        self.resolved: Final = resolve(request, given)
         experiment = build(self.resolved)
         try:
             check_possible(self.resolved, experiment)

@@ -31,22 +31,9 @@ from servobench.plant.contract.checks import FloatArray
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
 
 
-def run_experiment(
-    request: RunRequest, settings: Settings, *, steps: bool = True, picture: bool = False, keep: Path | None = None
-) -> RunResult:
-    """Carry one run out; the row's `status` and `reason` name a fault on the way.
-
-    Args:
-        request: the run.
-        settings: overrides of the defaults.
-        steps: also return one row a period.
-        picture: also return the last picture of the camera, if there is one.
-        keep: results folder in which trained networks are kept beside the runs.
-
-    Raises:
-        ConfigurationError: a name, setting, mismatch or seed that cannot be used.
-    """
-    return carry_out(resolve(request, settings), steps=steps, picture=picture, keep=keep)
+def run_experiment(request: RunRequest, settings: Settings, *, steps: bool = True) -> RunResult:
+    """Carry one run out, with overrides of the defaults; see `carry_out`."""
+    return carry_out(resolve(request, settings), steps=steps)
 
 
 def carry_out(
@@ -57,9 +44,17 @@ def carry_out(
     keep: Path | None = None,
     debug: bool = False,
 ) -> RunResult:
-    """Carry out a run whose settings are resolved; arguments and errors as in `run_experiment`.
+    """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
-    With `debug`, an error that is no `RunFault` is raised instead of noted.
+    Args:
+        resolved: the run.
+        steps: also return one row a period.
+        picture: also return the last picture of the camera, if there is one.
+        keep: results folder in which trained networks are kept beside the runs.
+        debug: raise an error that is no `RunFault` instead of noting it.
+
+    Raises:
+        ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
     experiment = build(resolved, keep=keep)
     plant, log, ending = experiment.plant, StepLog(experiment.plant.spec, experiment.periods), Ending()

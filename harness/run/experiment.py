@@ -20,10 +20,9 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -78,16 +77,25 @@ def draw(resolved: ResolvedRun) -> Drawn:
         ConfigurationError: a mismatch or a task that cannot be used.
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
-    sensing, seed = find_sensing(request.sensing), named_seed(request.seed, "mismatch")
+    true, sample, cameras = draw_robot(request)
+    moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
+    setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
+    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+
+
+def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraDraws | None]:
+    """Draw the true robot of a run with its cameras, and return the drawn values, too.
+
+    Raises:
+        ConfigurationError: a robot, sensing or mismatch that cannot be used.
+    """
+    robot, seed = find_robot(request.robot), named_seed(request.seed, "mismatch")
     try:
         arm, sample = sample_mismatch(request.mismatch, robot, seed)
-        true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
+        true, cameras = find_sensing(request.sensing).true(robot, arm, sample, request.mismatch, seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
-    moved = sample.moved(true, robot)
-    task_seed = named_seed(request.seed, "task")
-    setting = TaskSetting(true, true.arm.n, true.channel, task_seed, moved, robot, sensing.nominal(robot))
-    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+    return true, sample, cameras
 
 
 def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
@@ -105,7 +113,7 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         scenario = task.scenario(setting)
     except ValueError as error:
         raise ConfigurationError(f"task {name}: {error}") from error
-    check_times(resolved, scenario.duration)
+    _check_times(resolved, scenario.duration)
     return scenario
 
 
@@ -163,11 +171,9 @@ class Experiment:
         return np.stack(arrays) if self.together else arrays[0]
 
 
-def build_experiment(
-    request: RunRequest, settings: Settings, *, keep: Path | None = None, progress: Progress | None = None
-) -> Experiment:
+def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
     """Make a run ready from a request and overrides of the defaults; see `build`."""
-    return build(resolve(request, settings), keep=keep, progress=progress)
+    return build(resolve(request, settings))
 
 
 def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress | None = None) -> Experiment:
@@ -274,8 +280,8 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
         ConfigurationError: names it, and how far it is out of reach.
     """
     if experiment.drawn.true is not None:
-        check_joints(run, experiment.scenario, experiment.plant.spec)
-        check_reach(run, experiment.scenario, find_robot(run.request.robot), experiment.plant.spec)
+        _check_joints(run, experiment.scenario, experiment.plant.spec)
+        _check_reach(run, experiment.scenario, experiment.plant.spec)
 
 
 def train_networks(
@@ -355,12 +361,8 @@ def _build_controller(
         raise ConfigurationError(f"controller {name}: {error}") from error
 
 
-def check_times(resolved: ResolvedRun, duration: float) -> None:
-    """Refuse times that are longer than the run of `duration` [s], so that they never end in it.
-
-    Raises:
-        ConfigurationError: names the setting, the length of the run and the given value.
-    """
+def _check_times(resolved: ResolvedRun, duration: float) -> None:
+    """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
     times = {f"{plant}.command_delay": getattr(resolved.plant, "command_delay", 0.0)}
     if isinstance(sensing, SensingConfig):
@@ -377,19 +379,9 @@ def check_times(resolved: ResolvedRun, duration: float) -> None:
         )
 
 
-def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: PlantSpec) -> None:
-    """Refuse a target or a curve that no true robot of the run's mismatch can reach.
-
-    Args:
-        resolved: the run.
-        scenario: its task.
-        robot: the nominal one, which the mismatch starts from.
-        spec: joint limits of the plant.
-
-    Raises:
-        ConfigurationError: names the point that is farthest out of reach, and by how much.
-    """
-    task = resolved.request.task
+def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
+    """Refuse a target or a curve that no true robot of the run's mismatch can reach, by its farthest point."""
+    task, robot = resolved.request.task, find_robot(resolved.request.robot)
     if find_task(task).out_of_reach or not resolved.task.any_robot:  # other targets are taught on the true robot
         return
     if resolved.request.sensing != DEFAULT_SENSING:  # the features are no places
@@ -410,12 +402,8 @@ def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: P
         )
 
 
-def check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
-    """Refuse a start, or a target taught at joint positions, outside the joints' limits.
-
-    Raises:
-        ConfigurationError: names the first joint that is outside.
-    """
+def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
+    """Refuse a start, or a target taught at joint positions, outside the joints' limits."""
     for what, values in (("start", scenario.start), ("target", resolved.task.taught_at)):
         if values is None:
             continue

@@ -76,19 +76,17 @@ def network_source(
         progress: called with the share that is done while training.
     """
 
-    def train_cached(config: TrainingConfig, digest: str) -> TrainedNetworks:
+    def obtain(config: TrainingConfig) -> TrainedNetworks:
         def make(folder: Path) -> None:
             save_networks(train(config, nominal_jacobian, spec, progress), folder / FILE)
 
-        return load_networks(cached(NETWORKS, digest[:16], make) / FILE, digest)
-
-    def obtain(config: TrainingConfig) -> TrainedNetworks:
         with one_thread():
-            key = (cache_folder(NETWORKS), training_digest(config, nominal_jacobian, spec))
+            digest = training_digest(config, nominal_jacobian, spec)
+            key = (cache_folder(NETWORKS), digest)
             if key not in _KEPT:
                 while len(_KEPT) >= NETWORKS_KEPT:
                     _KEPT.pop(next(iter(_KEPT)))
-                _KEPT[key] = train_cached(config, key[1])
+                _KEPT[key] = load_networks(cached(NETWORKS, digest[:16], make) / FILE, digest)
         networks = _KEPT[key]
         if keep is not None:
             path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"

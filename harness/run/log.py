@@ -22,6 +22,7 @@ from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 JOINT_UNIT = "rad"
+COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +78,9 @@ class Steps:
             full_jacobian: add every entry of the estimated and of the true Jacobian.
         """
         columns: dict[str, object] = {"run_id": run_id, "step": np.arange(len(self)), "time_s": self.time}
-        features, joints, unit = self.spec.feature_names, self.spec.joint_names, self.spec.feature_unit
-        columns.update(_named("reference", features, unit, self.reference))
-        columns.update(_named("feature", features, unit, self.feature))
-        columns.update(_named("true_feature", features, unit, self.true_feature))
-        columns.update(_named("joint_position", joints, JOINT_UNIT, self.joint_position))
-        columns.update(_named("joint_velocity_command", joints, self.spec.command.unit, self.command))
+        logged = self.reference, self.feature, self.true_feature, self.joint_position, self.command
+        for names, values in zip(column_names(self.spec).values(), logged, strict=True):
+            columns.update(zip(names, values.T, strict=True))
         columns["error_norm"] = self.error_norm()
         columns["jacobian_error"] = self.jacobian_error()
         columns["jacobian_condition"] = self.jacobian_condition()
@@ -113,23 +111,17 @@ class StepLog:
             periods: how many rows there is room for.
             lanes: the leading axes of runs side by side.
         """
-        features, joints, jacobians = ((periods, *lanes, *own) for own in ((spec.m,), (spec.n,), (spec.m, spec.n)))
+        features, joints, jacobian = (*lanes, spec.m), (*lanes, spec.n), (*lanes, spec.m, spec.n)
+        shapes = {
+            **dict.fromkeys(("time", "controller_time", "plant_time"), ()),
+            **dict.fromkeys(("reference", "feature", "true_feature"), features),
+            **dict.fromkeys(("joint_position", "command"), joints),
+            **dict.fromkeys(("estimated_jacobian", "true_jacobian"), jacobian),
+        }
         self._count = 0
-        self._rows = Steps(
-            spec=spec,
-            time=np.empty(periods),
-            reference=np.empty(features),
-            feature=np.empty(features),
-            true_feature=np.empty(features),
-            joint_position=np.empty(joints),
-            command=np.empty(joints),
-            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
-            estimated_jacobian=np.full(jacobians, np.nan),
-            true_jacobian=np.full(jacobians, np.nan),
-            controller_time=np.empty(periods),
-            plant_time=np.empty(periods),
-            diagnostics={},
-        )
+        numbers = {name: np.full((periods, *shape), np.nan) for name, shape in shapes.items()}
+        valid = np.empty((periods, *lanes), dtype=np.bool_)
+        self._rows = Steps(spec, feature_valid=valid, diagnostics={}, **numbers)
 
     def add(
         self,
@@ -186,9 +178,12 @@ class StepLog:
         return Steps(rows.spec, **arrays, diagnostics={name: values[:k] for name, values in rows.diagnostics.items()})
 
 
-def column_name(kind: str, name: str, unit: str) -> str:
-    """Return the name of a column, such as `feature_x_m`."""
-    return f"{kind}_{name}_{column_unit(unit)}"
+def column_names(spec: PlantSpec) -> dict[str, list[str]]:
+    """Return the names of columns, such as `feature_x_m`, by kind in the order of the table of steps."""
+    features, joints = (spec.feature_names, spec.feature_unit), (spec.joint_names, JOINT_UNIT)
+    kinds = {"reference": features, "feature": features, "true_feature": features, "joint_position": joints,
+             COMMAND: (spec.joint_names, spec.command.unit)}  # fmt: skip
+    return {kind: [f"{kind}_{name}_{column_unit(unit)}" for name in names] for kind, (names, unit) in kinds.items()}
 
 
 def column_unit(unit: str) -> str:
@@ -205,8 +200,3 @@ def conditions(jacobian: FloatArray) -> FloatArray:
 
 def _flat(jacobian: FloatArray) -> FloatArray:
     return jacobian.reshape(*jacobian.shape[:-2], jacobian.shape[-2] * jacobian.shape[-1])
-
-
-def _named(kind: str, names: tuple[str, ...], unit: str, values: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    for name, column in zip(names, values.T, strict=True):
-        yield column_name(kind, name, unit), column

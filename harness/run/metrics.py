@@ -55,7 +55,8 @@ class Judged:
             steps.time, [evaluate_from - 1e-9, lap_time - 1e-9, 2.0 * lap_time - 1e-9]
         )
         self.evaluated, self.second_lap = self.error[..., judged_from:], self.error[..., second:third]
-        self.acceleration, self.jerk = command_derivatives(self.command, self.period)
+        self.acceleration = np.diff(self.command, axis=-1) / self.period  # without the step from rest
+        self.jerk = np.diff(self.acceleration, axis=-1) / self.period
 
     def same(self, value: float) -> FloatArray:
         """Return a value that all runs share, (...)."""
@@ -127,22 +128,21 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
     return {name: metric.values(run) for name, metric in METRICS.items() if metric.values is not None}
 
 
-def settling_time(error: FloatArray, band: npt.ArrayLike, period: float, dwell: float = DWELL) -> FloatArray:
+def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> FloatArray:
     """Return the first time after which `error` stays within `band`.
 
     Args:
         error: (..., k), one value a period [unit of the feature].
         band: one number or (...) [unit of the feature].
         period: [s].
-        dwell: least time within the band at the end [s].
 
     Returns:
-        (...) [s]; NaN if the error is outside at the end, or came in less than `dwell` before it.
+        (...) [s]; NaN if the error is outside at the end, or came in less than `DWELL` before it.
     """
     count = error.shape[-1]
     outside = ~(error <= np.asarray(band)[..., None])
     first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
-    return np.where((count - first) * period >= dwell - 1e-9, first * period, np.nan)
+    return np.where((count - first) * period >= DWELL - 1e-9, first * period, np.nan)
 
 
 def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
@@ -188,16 +188,6 @@ def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_
         earlier = sign[..., :-back]
         before[..., back:] = np.where(earlier == 0.0, before[..., back:], earlier)
     return np.asarray(np.count_nonzero(sign * before < 0.0, axis=(-2, -1)))
-
-
-def command_derivatives(command: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """Return acceleration, (..., n, k − 1) [rad/s²], and jerk, (..., n, k − 2) [rad/s³], of the commands.
-
-    They are differences of consecutive commands (..., n, k) [rad/s] over the period [s]; the step from rest to the
-    first command is none of them.
-    """
-    acceleration = np.diff(command, axis=-1) / period
-    return acceleration, np.diff(acceleration, axis=-1) / period
 
 
 def _path_length_ratio(run: Judged) -> FloatArray:

@@ -192,8 +192,3 @@ class FollowedCurve(ImageReference):
         ratio, pose = self.model.distance / self.robot.workspace.camera_distance, self.model.camera
         place = np.matvec(pose[:3, :3], ratio * self.curve.at(time)) + pose[:3, 3]
         return np.asarray(place[..., None, :] + (home - home.mean(axis=-2)))
-
-
-def in_space(curve: Reference, model: object, robot: Robot | None) -> Reference:
-    """Return the desired features of a ball on a curve: the curve itself where features are places."""
-    return FollowedCurve(model, curve, robot) if isinstance(model, SetupModel) and robot is not None else curve

@@ -6,17 +6,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import (
     controller_names,
     find_controller,
     find_plant,
     installed_plant,
+    is_foreign_controller,
     plant_names,
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.settings import Settings, nest
+from servobench.harness.config.settings import Settings, default_config, nest
 from servobench.harness.run.request import RunRequest, RunSettings, Varied
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
@@ -149,7 +148,7 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
             in a section of a file that does not run.
     """
     names = ["run", *dict.fromkeys(running)]
-    pairs = [section for section in settings.sections if _is_pair(section)]
+    pairs = [section for section in settings.sections if "+" in section and not is_foreign_controller(section)]
     settings.check_sections([*known_sections(), *pairs, *names])
     settings.check_running(names)
     for section in settings.sections:
@@ -170,8 +169,3 @@ def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
         return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
     except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
         return None
-
-
-def _is_pair(section: str) -> bool:
-    law, plus, estimator = section.partition("+")
-    return bool(plus) and law in LAWS and estimator in ESTIMATORS

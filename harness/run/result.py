@@ -8,18 +8,14 @@ package. A `RunFault` is no defect and has a place only if a plug-in raised it.
 from __future__ import annotations
 
 import inspect
-import site
-import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import entry_points
 from multiprocessing import parent_process
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from servobench.harness.config.source import ENGINE, is_users
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 if TYPE_CHECKING:
@@ -34,7 +30,7 @@ TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
-PACKAGE, HARNESS = __name__.partition(".")[0], str(Path(__file__).parents[1])
+HARNESS = str(ENGINE / "harness")
 
 
 class WrongAnswer(TypeError):
@@ -60,13 +56,14 @@ class Ending:
         error = _behind(error)
         place = _place(error)
         where = f" ({place})" if place else ""
-        trace = _trace(error) if place else ""
         if isinstance(error, RunFault):
-            return cls(error.status, f"{_one_line(error)}{where}", trace)
-        if isinstance(error, FloatingPointError):
-            return cls(NUMERICAL_ERROR, f"{_one_line(error)}{where}", trace)
-        status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        return cls(status, f"{describe_error(error)}{where}", trace)
+            status, reason = error.status, _one_line(error)
+        elif isinstance(error, FloatingPointError):
+            status, reason = NUMERICAL_ERROR, _one_line(error)
+        else:
+            status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+            reason = f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
+        return cls(status, f"{reason}{where}", _trace(error) if place else "")
 
 
 @dataclass(frozen=True)
@@ -90,11 +87,6 @@ class RunResult:
         """Return the result of a run of which only the columns of its request and its ending are known."""
         known = {"status": ending.status, "outcome": ending.status, "periods": 0, "reason": ending.reason}
         return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
-
-
-def describe_error(error: BaseException) -> str:
-    """Return the kind and the message of an error as one line."""
-    return f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
 
 
 def is_defect(error: BaseException) -> bool:
@@ -134,7 +126,11 @@ def _behind(error: BaseException) -> BaseException:
     behind = error
     while isinstance(behind, ConfigurationError) and behind.__cause__ is not None:
         behind = behind.__cause__
-    return behind if any(_is_users(frame) for frame, _ in traceback.walk_tb(behind.__traceback__)) else error
+    return (
+        behind
+        if any(is_users(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(behind.__traceback__))
+        else error
+    )
 
 
 def _place(error: BaseException) -> _Place | None:
@@ -142,9 +138,9 @@ def _place(error: BaseException) -> _Place | None:
     if isinstance(error, WrongAnswer):
         return _beginning(error.method)
     frames = list(traceback.walk_tb(error.__traceback__))
-    own = [(frame, line) for frame, line in frames if _is_users(frame)]
+    own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and is_defect(error):
-        own = [(frame, line) for frame, line in frames if _module(frame) == PACKAGE]
+        own = [(frame, line) for frame, line in frames if Path(frame.f_code.co_filename).is_relative_to(ENGINE)]
     if not own:
         return None
     frame, line = own[-1]
@@ -157,32 +153,6 @@ def _beginning(method: Callable[..., Any]) -> _Place | None:
     function = inspect.unwrap(getattr(method, "__func__", method))
     code = getattr(function, "__code__", None)
     return _Place(code.co_filename, code.co_firstlineno, code.co_qualname) if code else None
-
-
-def _module(frame: FrameType) -> str:
-    return str(frame.f_globals.get("__name__", "")).partition(".")[0]
-
-
-def _is_users(frame: FrameType) -> bool:
-    module, file = _module(frame), frame.f_code.co_filename
-    if module == PACKAGE or (file.startswith("<") and not file.startswith("<ipython")):
-        return False
-    return module in _plugin_packages() or not any(Path(file).is_relative_to(folder) for folder in _libraries())
-
-
-@cache
-def _plugin_packages() -> frozenset[str]:
-    """Return the top-level packages of other distributions that publish something for this package."""
-    groups = (group for group in entry_points().groups if group.startswith(f"{PACKAGE}."))
-    points = (point for group in groups for point in entry_points(group=group))
-    return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
-
-
-@cache
-def _libraries() -> tuple[str, ...]:
-    """Return the folders of the standard library and of installed packages."""
-    paths = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-    return *paths, *site.getsitepackages(), site.getusersitepackages()
 
 
 def _trace(error: BaseException) -> str:

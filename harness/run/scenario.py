@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 
-from servobench.harness.run.references import FixedPoint, Reference, TaskKind, TaughtImage, in_space
+from servobench.harness.run.references import FixedPoint, FollowedCurve, Reference, TaskKind, TaughtImage
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.signals import Channel
@@ -54,8 +54,10 @@ class TaskSetting:
         return len(self.feature.names) if self.model is None else 3
 
     def followed(self, curve: Reference) -> Reference:
-        """Return the desired features of a ball on a curve of places."""
-        return in_space(curve, self.model, self.robot)
+        """Return the desired features of a ball on a curve of places: the curve itself where features are places."""
+        if isinstance(self.model, SetupModel) and self.robot is not None:
+            return FollowedCurve(self.model, curve, self.robot)
+        return curve
 
     def taught(self, joint_position: FloatArray) -> Reference:
         """Return the target that is taught with the arm at a joint position, (n,) rad.
@@ -94,6 +96,8 @@ class Task(ABC):
 
     any_robot: ClassVar[bool] = False
     """Whether it also runs on a plant with a robot of its own: no target is given as joint positions."""
+    places: ClassVar[tuple[str, ...]] = ()
+    """Settings that are moved for another arm: points of the camera frame, and `start`, which is its home."""
 
     @property
     def taught_at(self) -> Vector | None:
@@ -109,7 +113,7 @@ class Task(ABC):
         """
 
     def scaled(self, name: str, work: Workspace) -> Self:
-        """Return the settings for another arm than the UR5's; by default the same.
+        """Return the settings for another arm than the UR5's; by default the same but for `places`.
 
         Joint positions are those found for the robot, lengths grow with its workspace, times stay.
 
@@ -117,8 +121,10 @@ class Task(ABC):
             name: of the task.
             work: the workspace of the robot.
         """
-        del name, work
-        return self
+        del name
+        points = {each: enlarged(work, getattr(self, each)) for each in self.places if each != "start"}
+        home = {"start": numbers(work.home)} if "start" in self.places else {}
+        return replace(self, **points, **home)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
-from servobench.harness.run.log import JOINT_UNIT, StepLog, column_name
+from servobench.harness.run.log import COMMAND, StepLog, column_names
 from servobench.harness.run.loop import LoopSettings, careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
@@ -21,7 +21,6 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
-COMMAND: Final = "joint_velocity_command"
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
@@ -54,11 +53,11 @@ class LoggedPlant(Plant):
                 f"rows of a log must be the control period of {spec.period:g} s apart, but row {row} of {len(time)} is "
                 f"at {time[row]:g} s after {time[0]:g} s"
             )
-        self._joints = _columns(table, joint_columns(spec, "joint_position", JOINT_UNIT))
-        self._features = _columns(table, feature_columns(spec, "feature"))
+        names = column_names(spec)
+        self._joints, self._features = _columns(table, names["joint_position"]), _columns(table, names["feature"])
         valid = table["feature_valid"] if "feature_valid" in table else np.ones(len(table))
         self._valid = np.asarray(valid, dtype=np.bool_)
-        true = feature_columns(spec, "true_feature")
+        true = names["true_feature"]
         known = set(true) <= set(table)
         self._true = table[true].to_numpy(np.float64) if known else np.full_like(self._features, np.nan)
 
@@ -105,7 +104,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         log = StepLog(spec, len(table))
         loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
         desired = experiment.desired(loop.periods)
-        logged = _columns(table, feature_columns(spec, "reference"))
+        logged = _columns(table, column_names(spec)["reference"])
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
         with careful():
@@ -116,7 +115,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     finally:
         experiment.plant.close()
     steps = log.steps().table(request.run_id)
-    names = command_columns(spec)
+    names = column_names(spec)[COMMAND]
     if set(names) <= set(table):
         steps[[LOGGED + name for name in names]] = _columns(table, names)
     return steps
@@ -145,21 +144,6 @@ def differences(steps: pd.DataFrame) -> pd.DataFrame:
     joints = [name.removeprefix(f"{COMMAND}_") for name in names]
     columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
     return pd.DataFrame(dict(zip(columns, (joints, *rms, np.abs(apart).max(axis=0)), strict=True)))
-
-
-def feature_columns(spec: PlantSpec, kind: str) -> list[str]:
-    """Return the names of the columns with the features of a kind, such as "reference"."""
-    return [column_name(kind, name, spec.feature_unit) for name in spec.feature_names]
-
-
-def joint_columns(spec: PlantSpec, kind: str, unit: str) -> list[str]:
-    """Return the names of the columns of a kind, one for each joint."""
-    return [column_name(kind, name, unit) for name in spec.joint_names]
-
-
-def command_columns(spec: PlantSpec) -> list[str]:
-    """Return the names of the columns with the commands."""
-    return joint_columns(spec, COMMAND, spec.command.unit)
 
 
 def _columns(table: pd.DataFrame, names: list[str]) -> FloatArray:

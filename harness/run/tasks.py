@@ -20,7 +20,7 @@ from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
-from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
+from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
@@ -86,16 +86,12 @@ class TargetTask(Task):
     """[s] length of the run"""
 
     any_robot: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("start", "target")
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         target = as_vector("target", self.target, setting.m)
         return setting.move(self.start, setting.followed(FixedPoint(target)), self.duration)
-
-    def scaled(self, name: str, work: Workspace) -> Self:
-        """See `Task.scaled`."""
-        del name
-        return replace(self, start=numbers(work.home), target=enlarged(work, self.target))
 
 
 @settings
@@ -167,6 +163,7 @@ class CurveTask(Task):
     """laps in the run; the last one is judged"""
 
     any_robot: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("start", "centre")
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -181,9 +178,8 @@ class CurveTask(Task):
 
     def scaled(self, name: str, work: Workspace) -> Self:
         """See `Task.scaled`."""
-        del name
         radius = None if self.radius is None else work.scale * self.radius
-        return replace(self, start=numbers(work.home), centre=enlarged(work, self.centre), radius=radius)
+        return replace(super().scaled(name, work), radius=radius)
 
 
 @settings
@@ -202,18 +198,13 @@ class LineTask(Task):
     """[s] length of the run"""
 
     any_robot: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("start", "begin", "end")
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         begin, end = (as_vector(name, getattr(self, name), setting.m) for name in ("begin", "end"))
         reference = setting.followed(line(begin, end, self.moving))
         return Scenario(setting.start(self.start), reference, self.duration, 0.5 * self.duration)
-
-    def scaled(self, name: str, work: Workspace) -> Self:
-        """See `Task.scaled`."""
-        del name
-        begin, end = enlarged(work, self.begin), enlarged(work, self.end)
-        return replace(self, start=numbers(work.home), begin=begin, end=end)
 
 
 @settings
@@ -228,6 +219,7 @@ class WaypointTask(Task):
     """[s] rest after the last waypoint"""
 
     any_robot: ClassVar[bool] = True
+    places: ClassVar[tuple[str, ...]] = ("start",)
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -237,11 +229,6 @@ class WaypointTask(Task):
         duration = float(reference.times[-1]) + self.settle
         check_number("last waypoint's time plus settle", duration, above=0.0)
         return Scenario(setting.start(self.start), reference, duration, 0.5 * duration)
-
-    def scaled(self, name: str, work: Workspace) -> Self:
-        """See `Task.scaled`."""
-        del name
-        return replace(self, start=numbers(work.home))
 
 
 def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, robot: Robot) -> bool:

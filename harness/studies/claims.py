@@ -42,8 +42,6 @@ from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
-from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import did_you_mean
 
 ALIKE_SHARE: Final = 0.10  # of the median settling time
 CLEAR_RATIO: Final = 2.0  # of step times, so large that every machine shows it
@@ -128,25 +126,6 @@ class Answer:
         return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
 
 
-def find_divisions(text: str) -> tuple[str, ...]:
-    """Return the divisions that a user named: `equipped`, `published` or `both`.
-
-    Raises:
-        ConfigurationError: none of these.
-    """
-    words = {"both": tuple(DIVISIONS)} | {name.split()[-1]: (name,) for name in DIVISIONS}
-    if text not in words:
-        raise ConfigurationError(
-            f"--division must be one of {', '.join(sorted(words))}, got {text!r}{did_you_mean(text, words)}"
-        )
-    return words[text]
-
-
-def plain_names(division: str) -> dict[str, str]:
-    """Return the four methods without their division, by the names that they have in it."""
-    return {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
-
-
 def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> dict[str, Campaign]:
     """Return the studies by name on `plants`: `seeds` robots for each move, two fifths of them for the circle.
 
@@ -186,8 +165,9 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
         plant: name of the plant.
         division: how the methods were equipped, a key of `DIVISIONS`.
     """
+    plain = {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
     own = {
-        name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain_names(division)})
+        name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain})
         for name, table in tables.items()
     }
     rules = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)

@@ -23,10 +23,9 @@ from servobench.harness.analysis.statistics import Estimate, median_with_interva
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import (
     TEXT,
@@ -125,29 +124,26 @@ def _cell(place: Place, request: RunRequest) -> Cell:
     return Cell(replace(request, varied=varied), place.columns)
 
 
-def make_map(
-    out: Path,
+def batch_of_map(
     plant: str,
     controllers: Sequence[str],
     seeds: Sequence[int],
-    settings: Settings,
-    how: Execution,
     robot: str = DEFAULT_ROBOT,
-    lines: Sequence[Line] = LINES,
     sensing: str = DEFAULT_SENSING,
-) -> list[Path]:
+) -> Batch:
+    """Return the runs at one place of a map: one robot for each seed, all methods, and the axis not varied yet."""
+    return Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot, (sensing,))
+
+
+def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines: Sequence[Line] = LINES) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
     Args:
         out: folder of the map.
-        plant: name of the plant.
-        controllers: names of the methods.
-        seeds: one robot each.
+        batch: its runs, see `batch_of_map`.
         settings: overrides of the defaults.
         how: how the runs are carried out.
-        robot: name, or the path of a file.
         lines: its axes.
-        sensing: set-up of its cameras.
 
     Returns:
         The files of the pictures.
@@ -155,18 +151,19 @@ def make_map(
     Raises:
         ConfigurationError: a plant with a robot of its own, or runs that `carry_out` refuses.
     """
+    (plant,) = batch.plants
     if find_plant(plant).own_robot:
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
-    check_settings(settings, [plant, TASK, *controllers])
+    check_settings(settings, [plant, TASK, *batch.controllers])
     settings = Settings(settings.sections)  # each part reads some of them
-    static, moved = map_cells(plant, controllers, seeds, robot, lines, sensing)
+    static, moved = map_cells(batch, lines)
     parts = {STATIC_CAMERA: Campaign(static, settings), MOVED_CAMERA: Campaign(moved, moved_settings(settings))}
     made = {name: campaign for name, campaign in parts.items() if len(campaign.cells)}
     carry_out_parts(made, out, how)
     results.write_summary(out, map_tables(out), results.read_manifest(out / next(iter(made))))
     limits: dict[str, float] = {}
-    if any(line.axis == LATENCY for line in lines) and sensing == DEFAULT_SENSING and plant not in RENDERED:
-        limits = predicted_limits(controllers, settings, robot)
+    if any(line.axis == LATENCY for line in lines) and batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED:
+        limits = predicted_limits(batch.controllers, settings, batch.robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
     return draw_map(results.load_runs(out), out / FIGURES, limits)
 
@@ -188,21 +185,13 @@ def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str 
     return limits
 
 
-def map_cells(
-    plant: str,
-    controllers: Sequence[str],
-    seeds: Sequence[int],
-    robot: str = DEFAULT_ROBOT,
-    lines: Sequence[Line] = LINES,
-    sensing: str = DEFAULT_SENSING,
-) -> tuple[Grid[Cell], Grid[Cell]]:
+def map_cells(batch: Batch, lines: Sequence[Line] = LINES) -> tuple[Grid[Cell], Grid[Cell]]:
     """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
-    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot, (sensing,)).requests()
     static, moved = (
         [Place(line.axis, magnitude) for line in lines if (line.axis == MOVE) == moves for magnitude in line.places]
         for moves in (False, True)
     )
-    return Grid(_cell, static, requests), Grid(_cell, moved, requests)
+    return Grid(_cell, static, batch.requests()), Grid(_cell, moved, batch.requests())
 
 
 def moved_settings(settings: Settings) -> Settings:

@@ -112,11 +112,6 @@ class SetupModel(RobotModel):
         """Return the true features, (..., m), for joint positions (..., n) in rad."""
         return self.feature_at(self.points(joint_position))
 
-    def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
-        y, J, _ = self.observe(joint_position)
-        return y, J
-
     def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return features (..., m), Jacobian (..., m, n) and which features are valid (..., m), all read-only."""
         points, motions = self.point_motions(joint_position)

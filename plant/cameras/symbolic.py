@@ -1,7 +1,6 @@
 """The symbolic twin of an arm and its cameras in CasADi: kinematics and the set-up's own function over expressions.
 
-    θ = g ⊙ q + o,     p_B = p_flange + R_flange t,     y = R_BCᵀ (p_B − p_BC)
-    ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i))
+    θ = g ⊙ q + o,     p_B = p_flange + R_flange t,     y = h(R_BCᵀ (p_B − p_BC))
 
 The kinematics uses the same table as `servobench.plant.robot.arm`. All functions take symbols or numbers, so that one
 expression serves both a model with fixed numbers and a function (or generated C code) whose geometry is a parameter. A
@@ -18,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
-from servobench.plant.cameras.optics import NEAR, Optics, project
-from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.cameras.optics import CAMERA, NEAR, Optics, ideal_optics, project
+from servobench.plant.cameras.setups import POSITION, SensingSetup
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 
@@ -49,47 +49,6 @@ class ArmGeometry(NamedTuple):
     def of(cls, arm: SerialArm) -> Self:
         """Return the geometry of `arm` as constants."""
         return cls(*map(casadi.SX, (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio)))
-
-
-class HandEyeGeometry(NamedTuple):
-    """Everything that describes an arm under a fixed camera, as CasADi symbols or constants.
-
-    Attributes:
-        arm: the arm.
-        tool: t, (3,), m, ball centre in the flange frame.
-        R_BC: (3, 3), camera in the base frame.
-        p_BC: (3,), m, camera in the base frame.
-    """
-
-    arm: ArmGeometry
-    tool: SX
-    R_BC: SX
-    p_BC: SX
-
-    @classmethod
-    def of(cls, model: HandEyeModel) -> Self:
-        """Return the geometry of `model` as constants."""
-        numbers = model.arm.tool, model.X_BC[:3, :3], model.X_BC[:3, 3]
-        return cls(ArmGeometry.of(model.arm), *map(casadi.SX, numbers))
-
-
-def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple[SX, SX]:
-    """Return the ball centre in the camera frame and its Jacobian as expressions.
-
-    Args:
-        joint_position: q, (n, 1), rad, as reported.
-        geometry: symbols or constants for n joints.
-
-    Returns:
-        y, (3, 1), m, and ∂y/∂q, (3, n), m/rad.
-    """
-    axes, origins, rotation, position = arm_frames(joint_position, geometry.arm)
-    ball = position + rotation @ geometry.tool
-    columns = [
-        geometry.arm.gear_ratio[i] * casadi.cross(axis, ball - origin)
-        for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
-    ]
-    return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
 
 
 def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], list[SX], SX, SX]:
@@ -128,10 +87,10 @@ class SetupGeometry:
     optics: Optics
 
     @classmethod
-    def of(cls, model: SetupModel) -> Self:
-        """Return the geometry of `model` as constants."""
-        poses = [(casadi.SX(pose[:3, :3]), casadi.SX(pose[:3, 3])) for pose in model.cameras]
-        return cls(ArmGeometry.of(model.arm), [casadi.SX(point) for point in model.target], poses, model.optics)
+    def of(cls, arm: SerialArm, target: FloatArray, cameras: FloatArray, optics: Optics) -> Self:
+        """Return the geometry of an arm, points (p, 3) m and camera poses (c, 4, 4) as constants."""
+        poses = [(casadi.SX(pose[:3, :3]), casadi.SX(pose[:3, 3])) for pose in cameras]
+        return cls(ArmGeometry.of(arm), [casadi.SX(point) for point in target], poses, optics)
 
 
 def symbolic_feature(model: RobotModel) -> casadi.Function:
@@ -141,13 +100,16 @@ def symbolic_feature(model: RobotModel) -> casadi.Function:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
     q = casadi.SX.sym("joint_position", model.arm.n)
+    setup = POSITION
+    mount: Mount = "fixed"
     if isinstance(model, HandEyeModel):
-        feature, _ = feature_and_jacobian(q, HandEyeGeometry.of(model))
+        geometry = SetupGeometry.of(model.arm, model.arm.tool[None], model.X_BC[None], ideal_optics(CAMERA, 1))
     elif isinstance(model, SetupModel):
-        geometry = SetupGeometry.of(model)
-        feature = features(points_in_cameras(q, geometry, model.mount), geometry.optics, model.setup)
+        setup, mount = model.setup, model.mount
+        geometry = SetupGeometry.of(model.arm, model.target, model.cameras, model.optics)
     else:
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
+    feature = features(points_in_cameras(q, geometry, mount), geometry.optics, setup)
     return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 

@@ -10,6 +10,7 @@ flipped bit or a file cut short never reaches a run. Entries that were not used 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import shutil
 import tempfile
@@ -116,8 +117,6 @@ def _prune(kind: Path) -> None:
 def _alone(kind: Path) -> Iterator[None]:
     """Hold a lock, until its file is closed, against other processes that move entries of a kind."""
     with (kind / ".lock").open("a") as file:
-        with contextlib.suppress(ImportError, OSError):  # Windows has no such locks, nor have all file systems.
-            import fcntl  # noqa: PLC0415
-
+        with contextlib.suppress(OSError):  # not all file systems have such locks
             fcntl.flock(file, fcntl.LOCK_EX)
         yield

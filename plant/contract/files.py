@@ -75,9 +75,7 @@ def sync(path: Path) -> None:
 
     Without it a file may have its name before it has its content, so that a power cut leaves an empty one.
     """
-    if os.name == "nt" and path.is_dir():
-        return  # Windows opens no folders
-    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -151,7 +151,10 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
                 raise ValueError(f"{name}.{key} is a section of its own, got {value!r}")
             changes[key] = override(f"{name}.{key}", present, value)
         else:
-            changes[key] = _convert(f"{name}.{key}", _adapters(cast(Any, type(default)))[key], value)
+            try:
+                changes[key] = _adapters(cast(Any, type(default)))[key].validate_python(_with_tuples(value))
+            except ValidationError as error:
+                raise ValueError(describe(error, f"{name}.{key}")) from None
     try:
         return replace(cast(Any, default), **changes) if changes else default
     except ValueError as error:
@@ -192,13 +195,6 @@ def _suggest_setting(key: str, section: object) -> str:
         if is_dataclass(part) and key in (item.name for item in fields(part)):
             return f"did you mean {f'{name}.{key}'!r}?"
     return suggest(key, known) if known else "it has none"
-
-
-def _convert(name: str, adapter: TypeAdapter[Any], value: object) -> Any:  # noqa: ANN401 - the adapter decides
-    try:
-        return adapter.validate_python(_with_tuples(value))
-    except ValidationError as error:
-        raise ValueError(describe(error, name)) from None
 
 
 def _with_tuples(value: object) -> object:

@@ -7,15 +7,14 @@ is judged by its table of contents before a byte is unpacked; Python's reader ne
 from __future__ import annotations
 
 import errno
-import hashlib
 import lzma
 import zipfile
 import zlib
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 from servobench.plant.contract.cache import cached
+from servobench.plant.contract.checksums import digest
 
 DESCRIPTION: Final = "modelDescription.xml"
 MAX_FILES: Final = 20_000  # number of files in an archive
@@ -41,18 +40,10 @@ def extract_fmu(path: Path) -> Path:
     try:
         if not path.is_file():
             raise ValueError(f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}")
-        status = path.stat()
-        digest = _digest(path.resolve(), status.st_mtime_ns, status.st_size)
+        key = digest(path)[:32]
     except OSError as error:
         raise ValueError(f"fmu file {path} cannot be read: {error.strerror}") from error
-    return cached("extracted", digest, lambda folder: _extract(path, folder))
-
-
-@lru_cache(maxsize=64)
-def _digest(path: Path, _modified: int, _size: int) -> str:
-    """Return the first half of the SHA-256 of a file; time and size make a changed file another key."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+    return cached("extracted", key, lambda folder: _extract(path, folder))
 
 
 def _extract(path: Path, folder: Path) -> None:

@@ -126,9 +126,11 @@ class FmuDescription:
                 raise ValueError(f"{role} names {name!r}, which is of type {variable.type}; wanted a real variable")
         return found
 
-    def select(self, names: Iterable[str], role: str) -> tuple[Variable, ...]:
-        """Return the real variables that `names` stand for, in order."""
-        return tuple(variable for name in names for variable in self.find(name, role))
+    def select(
+        self, names: Iterable[str], role: str, types: Container[str] | None = REAL_TYPES
+    ) -> tuple[Variable, ...]:
+        """Return the variables that `names` stand for, in order; arguments and errors as of `find`."""
+        return tuple(variable for name in names for variable in self.find(name, role, types))
 
     def resized(self, sizes: Mapping[str, int]) -> FmuDescription:
         """Return the description with other values of structural parameters, which give the sizes of arrays."""

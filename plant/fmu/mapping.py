@@ -12,9 +12,9 @@ The keys are the fields of `FmuMapping`, its sections the fields of their own cl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import MISSING, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, TypeVar, cast
 
 import numpy as np
 from annotated_types import MinLen
@@ -25,6 +25,7 @@ from servobench.plant.contract.settings import File, Names, Numbers, Positive, V
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.fmu.description import FmuDescription, total_size
 
+Roles = TypeVar("Roles")
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
 
 
@@ -129,13 +130,31 @@ def read_mapping(path: Path) -> FmuMapping:
     Raises:
         ValueError: an unreadable or malformed file, an unknown key, or a value of the wrong kind.
     """
-    table = read_toml("mapping", path)
-    for key in ("file", "inputs", "features"):
+    return make_mapping(FmuMapping, path, read_toml("mapping", path))
+
+
+def make_mapping(kind: type[Roles], path: Path, table: Mapping[str, Any]) -> Roles:
+    """Return the mapping that the keys of a file make.
+
+    Args:
+        kind: class of the mapping, with a `file` and a `debug_log`, whose paths begin in the folder of the file.
+        path: of the file.
+        table: its keys.
+
+    Raises:
+        ValueError: a missing or unknown key, or a value of the wrong kind.
+    """
+    needed = [
+        each.name for each in fields(cast(Any, kind)) if each.default is MISSING and each.default_factory is MISSING
+    ]
+    for key in needed:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
-    mapping = override(f"mapping {path}", FmuMapping(path, ("to be given",), ("to be given",)), table)
+    empty: Any = kind(**{key: path if key == "file" else ("to be given",) for key in needed})
+    mapping = override(f"mapping {path}", empty, table)
     log = None if mapping.debug_log is None else path.parent / mapping.debug_log
-    return replace(mapping, file=path.parent / mapping.file, debug_log=log)
+    made: Roles = replace(mapping, file=path.parent / mapping.file, debug_log=log)
+    return made
 
 
 def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float) -> PlantSpec:

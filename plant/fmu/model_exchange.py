@@ -2,13 +2,13 @@
 
     q -> (y, ∂y/∂q)
 
-The result answers like `plant.cameras.symbolic.feature_and_jacobian`, so that a model that is built on the project's
+The result answers like `plant.cameras.symbolic.symbolic_feature`, so that a model that is built on the project's
 own equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU with unknown equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +34,16 @@ class FmuModel:
     def __init__(
         self,
         path: Path,
-        joints: Sequence[str] = ("joint_position",),
-        features: Sequence[str] = ("ball_position",),
-        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        joints: Sequence[str],
+        features: Sequence[str],
+        parameters: Mapping[str, float],
     ) -> None:
         """Load the FMU.
 
         Args:
             path: the .fmu file, of FMI 2 with model exchange.
-            joints: names of states, or of families `name[1]`, `name[2]`, …
-            features: names of outputs, likewise.
+            joints: names of states.
+            features: names of outputs.
             parameters: values by name, instead of the start values.
 
         Raises:
@@ -51,7 +51,7 @@ class FmuModel:
         """
         root = extract_fmu(path)
         read_exchange(path, root)
-        self._feature = _feature_function(path, root, joints, features, dict(parameters or {}))
+        self._feature = _feature_function(path, root, joints, features, parameters)
         q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
         y = self._feature(q)
         outputs: list[Any] = [y, casadi.jacobian(y, q)]
@@ -104,28 +104,25 @@ def build_model(
 
 
 def _feature_function(
-    path: Path, root: Path, joints: Sequence[str], features: Sequence[str], parameters: dict[str, npt.ArrayLike]
+    path: Path, root: Path, joints: Sequence[str], features: Sequence[str], parameters: Mapping[str, float]
 ) -> Any:  # noqa: ANN401 - a casadi.Function
     """Return q -> y with everything else at its start."""
     try:
         builder = casadi.DaeBuilder("fmu", str(root))
-        states, outputs, constants = list(builder.x()), list(builder.y()), list(builder.p())
-        values = dict(zip(constants, _starts(builder, constants), strict=True))
-        fixed = list(builder.c())
-        for name, value in parameters.items():
-            names = _resolve("parameters", [name], [*constants, *fixed], f"parameters of {path.name}")
-            for each, number in zip(names, np.broadcast_to(np.ravel(value), (len(names),)).tolist(), strict=True):
-                if each in fixed:
-                    builder.set(each, number)
-                values[each] = number
-        chosen = _resolve("joints", joints, states, f"states of {path.name}")
-        builder.set_y(_resolve("features", features, outputs, f"outputs of {path.name}"))
+        states, constants, fixed = list(builder.x()), list(builder.p()), list(builder.c())
+        _check_names("parameters", parameters, [*constants, *fixed], f"parameters of {path.name}")
+        _check_names("joints", joints, states, f"states of {path.name}")
+        _check_names("features", features, list(builder.y()), f"outputs of {path.name}")
+        for name in set(fixed).intersection(parameters):
+            builder.set(name, parameters[name])
+        values = {**dict(zip(constants, _starts(builder, constants), strict=True)), **parameters}
+        builder.set_y(list(features))
         whole = builder.create("fmu", ["x", "u", "p"], ["y"])
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]  # The other lines name places in CasADi's code.
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
-    q = casadi.MX.sym("joint_position", len(chosen))
-    place = {name: i for i, name in enumerate(chosen)}
+    q = casadi.MX.sym("joint_position", len(joints))
+    place = {name: i for i, name in enumerate(joints)}
     rest = dict(zip(states, _starts(builder, states), strict=True))
     x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))
     inputs = casadi.DM(_starts(builder, list(builder.u())))
@@ -140,13 +137,8 @@ def _starts(builder: Any, names: list[str]) -> list[float]:  # noqa: ANN401 - a 
     return [start if np.isfinite(start) else 0.0 for start in starts]
 
 
-def _resolve(role: str, names: Sequence[str], known: list[str], group: str) -> list[str]:
-    """Return the variables that `names` stand for, in the FMU's order of each family."""
-    found: list[str] = []
+def _check_names(role: str, names: Iterable[str], known: list[str], group: str) -> None:
     for name in names:
-        members = [name] if name in known else [each for each in known if each.startswith(f"{name}[")]
-        if not members:
+        if name not in known:
             families = dict.fromkeys(each.partition("[")[0] for each in known)
             raise ValueError(f"{role} names {name!r}, which is none of the {group}: {', '.join(families) or 'none'}")
-        found += members
-    return found

@@ -61,10 +61,6 @@ class Patch:
     rows: IntArray
     columns: IntArray
 
-    def shifted(self, rows: int, columns: int) -> Patch:
-        """Return the patch shifted by numbers of pixels down and to the right."""
-        return Patch(self.rows + rows, self.columns + columns)
-
 
 @dataclass(frozen=True, eq=False)
 class Detection:
@@ -195,7 +191,7 @@ def find_ball(
     if patch is None:
         return None
     depth = camera.metric_depth(buffer[patch.rows, patch.columns])
-    patch = patch.shifted(*corner)
+    patch = Patch(patch.rows + corner[0], patch.columns + corner[1])
     return locate_ball(patch, depth if sense is None else sense(depth, patch), camera, radius)
 
 

@@ -69,12 +69,8 @@ class Lens:
             optics: of all cameras of the set-up.
             camera: the number of this one.
         """
-        own = Optics(
-            optics.focal[camera : camera + 1],
-            optics.centre[camera : camera + 1],
-            optics.distortion[camera : camera + 1],
-            optics.size,
-        )
+        this = slice(camera, camera + 1)
+        own = Optics(optics.focal[this], optics.centre[this], optics.distortion[this], optics.size)
         self._ideal = planned
         self._map: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None = None
         if as_planned(own, planned):

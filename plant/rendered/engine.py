@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window
@@ -82,14 +82,6 @@ class Machine:
     stops: tuple[FloatArray, FloatArray]
 
 
-class Joints(Protocol):
-    """The state of a simulation: an immutable value from which the engine can continue."""
-
-    @property
-    def angle(self) -> FloatArray:
-        """Joint angles θ, (n,) [rad]."""
-
-
 class Overlap(NamedTuple):
     """Two bodies that overlap by `MIN_OVERLAP` or more.
 
@@ -103,10 +95,13 @@ class Overlap(NamedTuple):
 
 
 class Simulation(ABC):
-    """An arm with mass and drives among obstacles; methods take its state and return a new one."""
+    """An arm with mass and drives among obstacles; methods take its state and return a new one.
+
+    A state has the joint angles θ as its `angle`, (n,) [rad].
+    """
 
     @abstractmethod
-    def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - `Joints` of its own, as below
+    def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - an immutable value of its own, as below
         """Return joints at rest at `angle` (n,) [rad] with drives that carry the arm's weight."""
 
     @abstractmethod

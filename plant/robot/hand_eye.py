@@ -22,8 +22,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 
-FEATURE_NAMES = ("x", "y", "z")
-FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
+FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
 WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are sought
 
@@ -70,25 +69,25 @@ class RobotModel(ABC):
         """
 
     @abstractmethod
+    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
+        """Return `feature`, `jacobian` and `valid`, all read-only, at the cost of one forward kinematics."""
+
     def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
+        """Return `feature` and `jacobian`, both read-only."""
+        return self.observe(joint_position)[:2]
 
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the true features, (..., m), for joint positions (..., n) in rad."""
-        return self.feature_and_jacobian(joint_position)[0]
+        return self.observe(joint_position)[0]
 
     def jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""
-        return self.feature_and_jacobian(joint_position)[1]
+        return self.observe(joint_position)[1]
 
     def valid(self, joint_position: npt.ArrayLike) -> BoolArray | None:
         """Return which features can be measured, (..., m); None where nothing can hide them."""
         del joint_position
         return None
-
-    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
-        """Return `feature`, `jacobian` and `valid` at the cost of one forward kinematics."""
-        return (*self.feature_and_jacobian(joint_position), self.valid(joint_position))
 
     def valid_jacobian(self, joint_position: npt.ArrayLike, home: FloatArray) -> FloatArray:
         """Return `jacobian`, or where a feature is not valid that of the last posture on the way there from home.
@@ -165,21 +164,13 @@ class HandEyeModel(RobotModel):
         """Return the middle of the workspace, about which the camera is turned."""
         return np.asarray(centre, dtype=np.float64)
 
-    def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return the ball centre in the camera frame, (..., 3) m, for joint positions (..., n) in rad."""
-        return self.to_camera(self.arm.ball_position(joint_position))
-
-    def jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return ∂feature/∂(joint position), (..., 3, n) m/rad, for joint positions (..., n) in rad."""
-        return self._turned(self.arm.ball_jacobian(joint_position))
-
-    def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
+    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, None]:
+        """Return the ball centre in the camera frame, (..., 3) m, and its Jacobian, (..., 3, n) m/rad."""
         p_B, J_B = self.arm.ball_and_jacobian(joint_position)
-        y, J = self.to_camera(p_B), self._turned(J_B)
+        y, J = self.to_camera(p_B), np.asarray(np.swapaxes(self.X_BC[..., :3, :3], -1, -2) @ J_B)
         y.setflags(write=False)
         J.setflags(write=False)
-        return y, J
+        return y, J, None
 
     def to_camera(self, p_B: npt.ArrayLike) -> FloatArray:
         """Return points of the base frame in the camera frame, (..., 3) m."""
@@ -189,10 +180,6 @@ class HandEyeModel(RobotModel):
         """Return points of the camera frame in the base frame, (..., 3) m."""
         p = np.asarray(p_C, dtype=np.float64)
         return np.asarray(np.matvec(self.X_BC[..., :3, :3], p) + self.X_BC[..., :3, 3])
-
-    def _turned(self, J_B: FloatArray) -> FloatArray:
-        """Return a Jacobian of the base frame, (..., 3, n), in the camera frame."""
-        return np.asarray(np.swapaxes(self.X_BC[..., :3, :3], -1, -2) @ J_B)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,5 +213,5 @@ def hand_eye_spec(
         ValueError: a period, speed or range that is not positive.
     """
     both = narrow_limits(limits, model.arm.n, max_joint_speed, joint_range)
-    spec = PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)
-    return replace(spec, feature=model.channel)
+    command = Channel(model.arm.joint_names, "rad/s", 1.0, -both.speed, both.speed)
+    return PlantSpec(model.channel, command, both.lower, both.upper, period)

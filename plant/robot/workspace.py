@@ -175,7 +175,7 @@ class Clearance:
         placed = self.tubes.placed(frames)
         fits = ((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1)
         fits &= (ball[..., 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed) & self._in_view(ball, placed)
-        fits &= self._apart(placed)
+        fits &= (self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1)
         return np.asarray(fits if singular else fits & (self.gain(q) >= MIN_GAIN * self.scale))
 
     def gain(self, joint_position: FloatArray) -> FloatArray:
@@ -201,9 +201,6 @@ class Clearance:
         line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
         free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
-
-    def _apart(self, placed: FloatArray) -> BoolArray:
-        return np.asarray((self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1))
 
 
 def collision_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:

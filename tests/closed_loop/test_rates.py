@@ -21,8 +21,6 @@ from servobench.plant.contract.signals import Observation
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER
 
-pytestmark = pytest.mark.xdist_group("rates")  # one process makes what these tests share
-
 MODEL = nominal_ur5()
 SLOW, FAST = 0.05, 0.008  # [s] control periods
 DURATION, PREVIEW, NOISE, BAND = 4.0, 0.5, 0.001, 0.01  # s, s, m, m

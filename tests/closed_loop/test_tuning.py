@@ -15,9 +15,8 @@ from servobench import controllers
 from servobench.controllers.aids import EQUIPPED
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.config.defaults import apply_settings, default_config
 from servobench.harness.config.registry import controller_names, find_controller
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import apply_settings, default_config, flatten
 from servobench.harness.studies.tuning.campaign import TOLERANCE, Change, Check, improvements
 from servobench.harness.studies.tuning.objective import (
     CONDITIONS,

@@ -66,6 +66,7 @@ def closed_loop(servo, lanes):
     return found, state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("entry", "aids", "source"), CHAINS)
 def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(entry, aids, source):
     initial = InitialConfig(source, probe_step=0.01, settle_periods=1, average_periods=1)

@@ -21,7 +21,7 @@ from servobench.controllers.networks.fit import train
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.check.controllers import ControllerChecks
-from servobench.harness.config.defaults import default_config
+from servobench.harness.config.settings import default_config
 from servobench.plant.contract.signals import Observation
 
 PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]
@@ -78,6 +78,7 @@ def random_run(controller, spec, seed, scale, steps=12, start=True):
 @pytest.mark.parametrize("entry", ALL)
 @settings(max_examples=8, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-3, 6))
+@pytest.mark.slow
 def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n, m, seed, exponent):
     knowledge = robot(n, m, seed)
     controller = entry.build(default_config(entry), knowledge)

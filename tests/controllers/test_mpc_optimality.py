@@ -83,6 +83,7 @@ def random_lanes(rng, scale):
     return look, reference, rng.normal(scale=0.4, size=(LANES, M, N))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 @pytest.mark.parametrize("limits", LIMITS)
 @pytest.mark.parametrize(("scale", "period"), [(1e-3, 0.05), (0.05, 0.05), (1.0, 0.05), (1.0, 0.02), (0.05, 0.0125)])

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kit.toy import jacobian_network
 from servobench.controllers.networks.rbf import (
@@ -103,19 +101,6 @@ def test_the_controller_equals_a_plain_loop_with_the_norm_squared_only_on_reques
 def test_the_information_vector_holds_the_errors_first_and_the_newest_of_each_first():
     xi = information_vector(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0, 6.0, 7.0]]))
     np.testing.assert_array_equal(xi, [1, 2, 3, 4, 5, 6, 7])
-
-
-@settings(max_examples=50, derandomize=True)
-@given(n=st.integers(2, 8), m=st.integers(1, 4), scale=st.floats(1e-6, 1e9))
-def test_features_lie_between_zero_and_one_at_any_distance(n, m, scale):
-    network, controller = jacobian_network(n, m), controller_network(n, m)
-    q = np.full(n, scale)
-    theta = jacobian_features(q, network.centres, network.widths)
-    h = controller.features(np.full(2 * m + n, scale))
-    assert ((theta > 0.0) & (theta <= 1.0)).all()
-    assert ((h > 0.0) & (h <= 1.0)).all()
-    assert network.jacobian(q).shape == (m, n)
-    assert (controller.n, controller.m) == (n, m)
 
 
 def test_networks_are_read_only():

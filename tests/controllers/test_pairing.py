@@ -115,7 +115,7 @@ def test_a_given_delay_is_used_as_it_is(latency):
     made, q = Following(latency=latency, delay="given"), path(1.0)
     made.follow(q, features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
-    exposed, before = made.stages.pairing.exposed(made.pair)
+    _, exposed, before, _ = made.stages.pairing.past(made.pair, q[-1], 1)
     at, rows = len(q) - 1 - latency / PERIOD, np.arange(len(q))
     wanted = [np.array([np.interp(place, rows, joint) for joint in q.T]) for place in (at, at - 1.0)]
     np.testing.assert_allclose(exposed, wanted[0], atol=1e-15)

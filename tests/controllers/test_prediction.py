@@ -13,7 +13,7 @@ from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.joint_response import JointResponse, with_response
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.prediction import FeatureFilter, Past, Predictor, shifted
+from servobench.controllers.stages.prediction import FeatureFilter, Predictor, shifted
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 NO_DELAYS = Delays(0.0, 0.0, 0.0)
@@ -28,11 +28,6 @@ def answered(response, steps=40, length=4, joints=3):
         commands.append(0.05 * rng.uniform(-1.0, 1.0, joints))
         made = made.command(commands[-1])
     return made, commands
-
-
-def test_the_response_of_the_joints_is_found():
-    made, _ = answered(RESPONSE)
-    np.testing.assert_allclose(made.response, RESPONSE, atol=0.01)
 
 
 def test_flight_and_lead_are_what_is_still_to_come():
@@ -205,8 +200,7 @@ class Seeing:
     def predict(self):
         self.estimation = self.stages.update(self.estimation, self.look, np.zeros(M))
         pair, pairing = self.estimation.learned.pair, self.stages.pairing
-        window = self.look.joint_position - pair.past[self.predictor.window, :N]
-        past = Past(pairing.delay(pair), *pairing.exposed(pair), window)
+        past = pairing.past(pair, self.look.joint_position, self.predictor.window)
         self.state, bound = self.predictor.predict(self.state, A, past, self.look)
         return bound
 
@@ -259,25 +253,6 @@ def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     np.testing.assert_allclose(moved[-1], steps.sum(axis=0), atol=1e-5)
 
 
-def test_each_half_alone_makes_up_for_its_part():
-    """`delay` brings the feature to the present, `response` to where the commands so far will lead."""
-    rng = np.random.default_rng(0)
-    made = {
-        "delay": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5), 2), Delays(0.1, 0.0, 0.0), delay="given"),
-        "response": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5)), NO_DELAYS, response="identified"),
-    }
-    for k in range(40):
-        step = 0.05 * rng.uniform(-1.0, 1.0, N)
-        for half, each in made.items():
-            bound = each.predict()
-            if k > 20:
-                expected = each.arm.end() if half == "response" else A @ each.arm.q
-                np.testing.assert_allclose(bound.feature, expected, atol=1e-3)
-                assert (bound.lead > 1.0) == (half == "response")
-                np.testing.assert_array_equal(bound.joint_position == each.look.joint_position, half == "delay")
-            each.send(step)
-
-
 def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     made = Seeing(ToyArm(np.eye(M)), delay="identified", filter=True)
     for k in range(8):
@@ -287,9 +262,10 @@ def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     learned = made.estimation.learned._replace(pair=pair._replace(candidate=np.int_(3)))
     made.estimation = made.estimation._replace(learned=learned)
     made.look = seen(made.look.joint_position, np.array([0.5, 0.1, -0.2]), valid=False, k=8)
-    exposed, _ = made.stages.pairing.exposed(made.stages.pairing.advance(learned.pair, made.look.joint_position))
+    pairing, at = made.stages.pairing, made.look.joint_position
+    past = pairing.past(pairing.advance(learned.pair, at), at, 1)
     bound = made.predict()
-    np.testing.assert_allclose(bound.feature, made.look.feature + A @ (made.look.joint_position - exposed))
+    np.testing.assert_allclose(bound.feature, made.look.feature + A @ (at - past.exposed))
     assert made.state.delay == made.stages.pairing.delays[3]
 
 
@@ -298,12 +274,6 @@ def test_the_shifted_reference_is_interpolated_and_goes_on():
     for lead, expected in ((0.0, [0.0, 1.0]), (1.5, [2.5, 4.5]), (2.25, [4.25, 5.25]), (7.5, [9.5, 10.5])):
         np.testing.assert_allclose(shifted(reference, np.array(lead), 2)[:, 0], expected)
     np.testing.assert_allclose(shifted(reference[:1], np.array(1.5), 1), [[0.0]])
-
-
-def test_every_lane_has_its_own_shift():
-    reference, leads = np.random.default_rng(0).normal(size=(3, 6, 2)), np.array([0.0, 1.5, 8.25])
-    single = [shifted(one, lead, 4) for one, lead in zip(reference, leads, strict=True)]
-    np.testing.assert_array_equal(shifted(reference, leads, 4), single)
 
 
 def test_the_nominal_model_is_asked_only_where_a_stage_predicts_with_it():

@@ -116,6 +116,7 @@ def test_the_scale_follows_noise_that_is_larger_than_configured():
     assert run.diagnostics()["rejected_share"] < 0.1
 
 
+@pytest.mark.slow
 def test_in_the_loop_its_jacobian_bears_40_percent_outlier_frames():
     def jacobian_errors(estimator):
         name = f"pid+{estimator}"

@@ -7,6 +7,7 @@ import pytest
 
 from kit.toy import PERIOD, plant_spec
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.laws.mpc.mpc import MpcConfig
 from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import FORMAT, TrainedNetworks, load_networks, save_networks
@@ -23,8 +24,6 @@ from servobench.controllers.networks.fit import (
     unit_points,
 )
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
-
-pytestmark = pytest.mark.xdist_group("training")  # one process makes what these tests share
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid")]
 N, M = 3, 2
@@ -301,6 +300,18 @@ def test_a_jacobian_that_the_network_can_represent_is_fitted_to_the_last_digits(
     assert fitted.jacobian_error < 1e-6
     q = np.full(N, 1.1)
     np.testing.assert_allclose(fitted.jacobian.jacobian(q), true.jacobian(q), atol=1e-5)
+
+
+def test_rules_across_settings_name_both():
+    for config, values, message in (
+        (MpcConfig, {"view_tangent": (0.5,)}, r"empty or \(horizontal, vertical\), got \(0.5,\)"),
+        (ControllerTraining, {"samples": 59}, "samples must be at least the 60 hidden units, got 59"),
+        (JacobianTraining, {"centres": 60, "samples": 59}, "samples must be at least the 60 centres, got 59"),
+        (TrainingConfig, {"lower": (0.0,), "upper": (1.0, 1.0)}, "lower and upper must be equally long, got 1 and 2"),
+        (TrainingConfig, {"lower": (1.0,), "upper": (1.0,)}, "lower must be below upper"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            config(**values)
 
 
 def test_a_region_of_another_robot_is_refused():

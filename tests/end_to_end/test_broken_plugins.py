@@ -13,8 +13,6 @@ from kit.command import PACKAGE
 from kit.own import CELL, CONFIGURED, install, write
 from servobench.harness.config.registry import RENDERED
 
-pytestmark = pytest.mark.xdist_group("broken_plugins")  # one process makes what these tests share
-
 POINTS = """[servobench.controllers]
 whole = some_law:Mine
 import-error = some_crash:ENTRY

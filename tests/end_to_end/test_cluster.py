@@ -24,10 +24,10 @@ SWEEP = ("sweep", "--controllers", "broyden,rls", "--seeds", "300", "--set", "ra
 RUNS = 600  # six blocks: the first is there long before the last
 
 
-@pytest.fixture
-def cluster(tmp_path):
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
     """The address of a scheduler and its two workers."""
-    started = []
+    tmp_path, started = tmp_path_factory.mktemp("cluster"), []
 
     def launch(name, *arguments):
         with (tmp_path / f"{name}.log").open("wb") as log:
@@ -54,21 +54,6 @@ def cluster(tmp_path):
             process.wait()
 
 
-def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
-    scheduler, workers = cluster
-    local = start(*SWEEP, "--out", str(tmp_path / "local"), "--workers", "1")
-    remote = start(*SWEEP, "--out", str(tmp_path / "remote"), "--scheduler", scheduler)
-    wait_for(lambda: part_count(tmp_path / "remote") > 0)
-    os.killpg(workers[0].pid, signal.SIGKILL)
-    finished_before = len(results.load_runs(tmp_path / "remote"))
-    for process in (local, remote):
-        code, output = finish(process)
-        assert code == 0, output
-    assert 0 < finished_before < RUNS
-    tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
-
-
 def test_a_cluster_carries_out_a_controller_and_a_plant_from_files(cluster, tmp_path):
     cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
     named = f"--plants {cell}:Cell --controllers {mine},constant --tasks exp1 --seeds 2 --no-report"
@@ -84,6 +69,21 @@ def test_a_cluster_carries_out_a_controller_and_a_plant_from_files(cluster, tmp_
     assert set(tables[0]["plant"]) == {"Cell"}
     assert set(tables[0]["controller"]) == {"Mine", "constant"}
     assert not set(tables[0]["outcome"]) & {"crashed"}, tables[1]["reason"].tolist()
+
+
+def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
+    scheduler, workers = cluster
+    local = start(*SWEEP, "--out", str(tmp_path / "local"), "--workers", "1")
+    remote = start(*SWEEP, "--out", str(tmp_path / "remote"), "--scheduler", scheduler)
+    wait_for(lambda: part_count(tmp_path / "remote") > 0)
+    os.killpg(workers[0].pid, signal.SIGKILL)
+    finished_before = len(results.load_runs(tmp_path / "remote"))
+    for process in (local, remote):
+        code, output = finish(process)
+        assert code == 0, output
+    assert 0 < finished_before < RUNS
+    tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
 
 @pytest.mark.parametrize("plant", ["kinematic", pytest.param("bullet", marks=NEEDS_BULLET)])
 def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
-    monkeypatch, tmp_path, plant
+    no_figures, monkeypatch, tmp_path, plant
 ):
     tables = []
     for workers in ("1", "2"):

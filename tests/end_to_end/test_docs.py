@@ -90,16 +90,11 @@ def installed(tmp_path, monkeypatch):
     def install(text):
         project, code = tomllib.loads(blocks(text, "toml")[0])["project"], blocks(text, "python")[0]
         module = project["name"].replace("-", "_")
-        (tmp_path / f"{module}.py").write_text(code, encoding="utf-8")
-        information = tmp_path / f"{module}-{project['version']}.dist-info"
-        information.mkdir()
-        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: 0.1\n")
         points = [
             f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in entries.items())
             for group, entries in project["entry-points"].items()
         ]
-        (information / "entry_points.txt").write_text("".join(points))
-        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.syspath_prepend(install(tmp_path, module, code, "".join(points)))
         importlib.invalidate_caches()
         forget()
         modules.append(module)

@@ -26,7 +26,7 @@ CONTINUED = re.compile(r"\s*\\\n\s+")
 BATCHES = ("run", "compare", "sweep", "robustness", "claims")  # carried out up to the first worker
 QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  # carried out whole
 ONLY_READ = {
-    "fmu": "compiles a model, which test_fmu_commands.py does",
+    "fmu": "compiles a model, which test_robot_commands.py does",
     "record": "renders a film, which test_record.py does",
     "train": "trains networks, which the tests of controllers do",
     "tune": "takes hours; test_tune_command.py makes a few trials",

@@ -29,8 +29,6 @@ from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.fmu.world import FmuConfig
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
-pytestmark = pytest.mark.xdist_group("docs_tables")  # one process makes what these tests share
-
 PACKAGE = "servobench"
 
 

@@ -9,16 +9,7 @@ from pathlib import Path
 import pytest
 
 from kit.command import servobench
-from kit.foreign_fmu import build_crane, describe_with
-from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.request import RunRequest
-
-JOINTS = 'joints = ["wheel.slew", "wheel.luff"]'
-MAPPING = {
-    2: f'inputs = ["push.slew", "push.luff"]\nfeatures = ["place.slew", "place.luff"]\n{JOINTS}\n',
-    3: 'inputs = "push"\nfeatures = "place"\njoints = "wheel"\n',
-}
+from kit.foreign_fmu import build_crane, describe_with, mapping
 
 FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
@@ -35,7 +26,7 @@ def temporary(tmp_path, monkeypatch):
 
 
 def run(monkeypatch, tmp_path: Path, version: int, more: str = "") -> tuple[int, Path]:
-    (tmp_path / "crane.toml").write_text(f'file = "crane.fmu"\n{MAPPING[version]}{more}')
+    (tmp_path / "crane.toml").write_text(mapping(version) + more)
     out = tmp_path / "out"
     task = ["--task", "target", "--set", "target.target=[0.2,0.7]", "--set", "target.duration=1"]
     start = ["--controller", "broyden", "--set", "broyden.initial.source=probe", "--mismatch", "none"]
@@ -106,20 +97,3 @@ def test_an_fmu_that_does_not_fit_is_one_line(
     assert message in line
     assert code == 2
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("version", "quirk", "message"),
-    [
-        (2, 1, "fmi2DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
-        (3, 7, "crane.fmu returned something that is not finite for place[2]"),
-    ],
-)
-def test_a_failure_during_the_run_is_its_status_and_reason(version, quirk, message, tmp_path, temporary):
-    build_crane(tmp_path / "crane.fmu", version)
-    (tmp_path / "crane.toml").write_text(f'file = "crane.fmu"\n{MAPPING[version]}[parameters]\nquirk = {quirk}\n')
-    settings = Settings({"target": {"target": [0.2, 0.7]}, "broyden": {"initial": {"source": "probe"}}})
-    request = RunRequest(f"fmu:{tmp_path / 'crane.toml'}", "broyden", "target", "none", 0)
-    row = run_experiment(request, settings).row
-    assert row["status"] == "fmu_error"
-    assert message in row["reason"]

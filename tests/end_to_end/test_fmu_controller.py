@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kit.controller_fmus import exported
-from kit.foreign_fmu import build_crane, build_pilot
+from kit.foreign_fmu import build_crane, build_pilot, mapping
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import choose_controller, find_controller
 from servobench.harness.config.settings import Settings
@@ -32,12 +32,6 @@ joints = ["angle.slew", "angle.luff"]
 reference = ["goal.slew", "goal.luff"]
 seen = ["clear.slew", "clear.luff"]
 parameters = {gain = 1.5}
-"""
-CRANE = """
-file = "crane.fmu"
-inputs = ["push.slew", "push.luff"]
-joints = ["wheel.slew", "wheel.luff"]
-features = ["place.slew", "place.luff"]
 """
 
 
@@ -91,7 +85,7 @@ def test_a_mapping_names_the_variables_and_a_saved_state_goes_on_with_equal_bits
 def test_a_foreign_controller_and_a_foreign_plant_close_a_loop_without_code(tmp_path):
     build_crane(tmp_path / "crane.fmu", 2)
     build_pilot(tmp_path / "pilot.fmu")
-    (tmp_path / "crane.toml").write_text(CRANE)
+    (tmp_path / "crane.toml").write_text(mapping(2))
     (tmp_path / "pilot.toml").write_text(PILOT)
     done = run(
         str(tmp_path / "pilot.toml"), f"fmu:{tmp_path / 'crane.toml'}", task="target", mismatch="none",

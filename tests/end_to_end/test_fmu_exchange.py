@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kit.foreign_fmu import build_crane, describe_exchange
+from kit.foreign_fmu import ROLES, build_crane, describe_exchange
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.mapping import FmuMapping
@@ -58,9 +58,7 @@ def test_an_integrated_fmu_agrees_with_its_co_simulation_also_at_stops(version, 
 def test_what_an_fmu_refuses_within_the_solver_is_told(tmp_path):
     description = re.sub(r"<CoSimulation[^>]*/>", "", describe_exchange())
     path = build_crane(tmp_path / "crane.fmu", 2, description=description)
-    roles = [tuple(f"{name}.{part}" for part in ("slew", "luff")) for name in ("push", "wheel", "place")]
-    mapping = FmuMapping(path, **dict(zip(("inputs", "joints", "features"), roles, strict=True)))
-    world = FmuWorld(mapping, None, 0.05)
+    world = FmuWorld(FmuMapping(path, **ROLES[2]), None, 0.05)
     np.testing.assert_allclose(world.advance(np.array([0.2, -0.4])) - [0.3, 1.2], [0.01, -0.02], atol=1e-9)
     with pytest.raises(FmuError, match="GetDerivatives returned error"):
         world.advance(np.array([99.0, 0.0]))

@@ -101,7 +101,7 @@ def test_a_model_comes_back_from_its_parameters(mismatch):
 
 def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
     path = export_fmu(tmp_path / "severe.fmu", ExportOptions(2, mismatched("severe"), mismatch="severe, seed 3"))
-    starts = {variable.name: variable.start for variable in read_information(path).variables}
+    starts = {each.name: each.start for each in read_information(path).description.modelVariables}
     wanted = parameters_of(mismatched("severe"), default_actuation())
     for group in arm_layout(6).of_role("parameter"):
         assert [float(starts[name]) for name in group.scalar_names()] == wanted[group.name].tolist()
@@ -219,15 +219,16 @@ def test_the_library_needs_libc_and_libm_only(version, tmp_path):
 @pytest.mark.parametrize("version", VERSIONS)
 def test_information_tells_version_platform_and_variables(version):
     information = read_information(cached_fmu(version))
-    assert information.fmi_version == f"{version}.0"
+    described = information.description
+    assert described.fmiVersion == f"{version}.0"
     assert information.platforms == (this_platform().folder(version),)
     assert information.has_sources
     assert list(information.interfaces) == ["co-simulation", "model exchange"]
     for capabilities in information.interfaces.values():
         assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
         assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
-    assert len(information.variables) == (171 if version == 2 else 30)
-    assert all(variable.unit and variable.description for variable in information.variables) or version == 2
+    assert len(described.modelVariables) == (171 if version == 2 else 30)
+    assert all(variable.unit and variable.description for variable in described.modelVariables) or version == 2
 
 
 def tampered(path: Path, target: Path, name: str, change) -> Path:

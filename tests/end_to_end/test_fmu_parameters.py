@@ -7,25 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kit.foreign_fmu import build_crane, describe_with
-from servobench.fmus.inspection import read_information
+from kit.foreign_fmu import ROLES, build_crane, describe_with
+from servobench.fmus.inspection import read_information, shape_of
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 
 START = np.array([0.3, 1.2])
-NAMES = {
-    2: {
-        "inputs": ("push.slew", "push.luff"),
-        "joints": ("wheel.slew", "wheel.luff"),
-        "features": ("place.slew", "place.luff"),
-    },
-    3: {"inputs": ("push",), "joints": ("wheel",), "features": ("place",)},
-}
 
 
 def moved(path: Path, version: int, **changes) -> np.ndarray:
     """Return by how much the joints moved in a period, under (0.1, 0.2) rad/s, after a reset."""
-    world = FmuWorld(FmuMapping(path, **{**NAMES[version], **changes}), None, 0.05)
+    world = FmuWorld(FmuMapping(path, **{**ROLES[version], **changes}), None, 0.05)
     world.advance(np.array([1.0, 1.0]))
     start = world.reset(0)
     motion = world.advance(np.array([0.1, 0.2])) - start
@@ -62,7 +54,7 @@ def test_a_file_gives_truth_values_and_texts(tmp_path):
 def test_results_of_single_precision_are_features(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 3)
     worlds = [
-        FmuWorld(FmuMapping(path, **{**NAMES[3], "features": (name,)}), None, 0.05) for name in ("place", "shade")
+        FmuWorld(FmuMapping(path, **{**ROLES[3], "features": (name,)}), None, 0.05) for name in ("place", "shade")
     ]
     for world in worlds:
         world.advance(np.array([0.3, 0.4]))
@@ -74,14 +66,14 @@ def test_results_of_single_precision_are_features(tmp_path):
 
 def test_information_tells_sizes_that_parameters_give(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 3)
-    shapes = {variable.name: variable.shape for variable in read_information(path).variables}
+    shapes = {each.name: shape_of(each) for each in read_information(path).description.modelVariables}
     assert (shapes["wheel"], shapes["probe"], shapes["gear"]) == ((2,), (1,), ())
 
 
 def test_a_structural_parameter_gives_an_array_its_size(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 3)
     parameters = {"samples": np.array(4.0)}
-    world = FmuWorld(FmuMapping(path, **{**NAMES[3], "features": ("probe",)}, parameters=parameters), None, 0.05)
+    world = FmuWorld(FmuMapping(path, **{**ROLES[3], "features": ("probe",)}, parameters=parameters), None, 0.05)
     for _ in range(2):
         assert world.spec.m == 4
         np.testing.assert_allclose(np.diff(world.see()), 1.0)
@@ -113,7 +105,7 @@ def test_a_step_that_the_fmu_cannot_take_names_the_remedy(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 3, description=fixed)
     with pytest.raises(ValueError, match=r"multiples of 0.02 s only .* period must be one, got 0.05 s"):
         moved(path, 3)
-    world = FmuWorld(FmuMapping(path, **NAMES[3]), None, 0.04)
+    world = FmuWorld(FmuMapping(path, **ROLES[3]), None, 0.04)
     world.close()
 
 

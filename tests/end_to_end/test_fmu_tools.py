@@ -13,14 +13,17 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from functools import cache
 
 import numpy as np
 import pandas as pd
 import pytest
 from fmpy import simulate_fmu
+from fmpy.ssp.ssd import read_ssd
 
 from kit.plants import configure, mismatched
+from night.system_loops import Loop, agree, both, write
 from servobench.fmus.export import arm_layout, default_actuation
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
@@ -157,6 +160,24 @@ def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
     exact = simulated("none", held[:20])[-1, :6]
     np.testing.assert_allclose(came.iloc[-1], exact, rtol=0, atol=1e-9 if kind == "cs" else 1e-3)
     assert np.ptp(came, axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [Loop("ukf_mfac:published"), Loop("map_mfac", "ur10e"), Loop("ukf_mfac:published", sensing="pixel")],
+    ids=" ".join,
+)
+def test_fmpy_runs_a_system_of_plant_and_controller_as_the_harness_runs_the_loop(loop, tmp_path):
+    """All methods and more arms: `python -m night.system_loops`, a part of `make nightly`."""
+    path = write(loop, tmp_path)
+    found, wanted = both(loop, path)
+    assert agree(loop, found, wanted), np.abs(found - wanted).max()
+    assert not agree(loop, found + 1e-6 * np.abs(wanted).max(), wanted)
+    read_ssd(str(path))  # checks it against the schema
+    with zipfile.ZipFile(path) as archive:
+        assert archive.namelist() == ["SystemStructure.ssd", "resources/controller.fmu", "resources/plant.fmu"]
+        text = archive.read("SystemStructure.ssd").decode()
+    assert text.count("<ssd:Connection ") == 12 + 2 * (wanted.shape[1] - 6)  # of joints, features
 
 
 COSIM = """

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from kit import foreign_fmu
 from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe
 from servobench.fmus.compiler import this_platform
@@ -25,10 +26,6 @@ RUN = (
     "--controllers", "broyden", "--tasks", "target", "--mismatch", "none", "--seeds", "2", "--set",
     "target.target=[0.2,0.7]", "--set", "target.duration=0.5", "--set", "broyden.initial.source=probe",
 )  # fmt: skip
-MAPPING = (
-    'file = "crane.fmu"\ninputs = ["push.slew", "push.luff"]\nfeatures = ["place.slew", "place.luff"]\n'
-    'joints = ["wheel.slew", "wheel.luff"]\n'
-)
 
 
 @pytest.fixture
@@ -44,7 +41,7 @@ def mapping(tmp_path) -> Path:
         archive.writestr(INPUT_FILE, "time,push.slew,push.luff\n0,0,0\n0.05,0,0\n")
         archive.writestr(OUTPUT_FILE, "time,wheel.slew,wheel.luff\n0,0.5,0.4\n0.05,0.5,0.4\n")
     path = tmp_path / "crane.toml"
-    path.write_text(MAPPING)
+    path.write_text(foreign_fmu.mapping(2))
     return path
 
 
@@ -65,7 +62,7 @@ def test_an_fmu_that_ends_its_process_ends_no_command(mapping, monkeypatch, caps
 def test_an_fmu_that_the_user_trusts_shares_a_process(tmp_path, monkeypatch):
     build_crane(tmp_path / "crane.fmu", 2)
     path = tmp_path / "crane.toml"
-    path.write_text(MAPPING)
+    path.write_text(foreign_fmu.mapping(2))
     plant = f"fmu:{path}"
     for trusted in (False, True):
         settings = Settings({plant: {"isolate": not trusted}})

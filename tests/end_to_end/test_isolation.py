@@ -10,14 +10,11 @@ import time
 from pathlib import Path
 
 import pandas as pd
-import psutil
 import pytest
 
-from kit.command import finish, judged, part_count, servobench, start, wait_for
+from kit.command import finish, judged, left_behind, part_count, servobench, start, wait_for
 from night import hostile_controllers
 from servobench.harness.batch import results
-
-pytestmark = pytest.mark.xdist_group("isolation")  # one process makes what these tests share
 
 HOSTILE = Path(hostile_controllers.__file__)
 MARK = "SERVOBENCH_TEST_MARK"  # an environment variable that all processes of a command inherit
@@ -56,21 +53,9 @@ def places(*names: str) -> str:
     return ",".join(f"{HOSTILE}:{name}" for name in names)
 
 
-def left_behind(mark: str) -> list[str]:
-    """Return the command lines of the processes that have the mark of a command in their environment."""
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if process.environ().get(MARK) == mark and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(" ".join(process.cmdline()))
-        except psutil.Error:
-            continue
-    return found
-
-
 def assert_nothing_stays(mark: str) -> None:
     deadline = time.monotonic() + SOON
-    while left := left_behind(mark):
+    while left := left_behind(MARK, mark):
         assert time.monotonic() < deadline, left
         time.sleep(0.05)
 
@@ -148,7 +133,7 @@ def test_nothing_outlives_a_command_that_is_killed(tmp_path):
     out, mark = tmp_path / "out", "orphans"
     hanging = ("--controllers", places("HangsWithChildren", "Hangs"), "--workers", "2", *SHORT, "--out", str(out))
     process = start("sweep", *hanging, **{MARK: mark})
-    wait_for(lambda: any("time.sleep(300)" in line for line in left_behind(mark)))
+    wait_for(lambda: any("time.sleep(300)" in line for line in left_behind(MARK, mark)))
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     assert_nothing_stays(mark)

@@ -14,8 +14,6 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / ".ci"))
 import release  # noqa: E402 - a script beside the package
 
-pytestmark = pytest.mark.xdist_group("packaging")  # one process makes what these tests share
-
 FOLDERS = ("plant", "controllers", "fmus", "harness")
 CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml")
 

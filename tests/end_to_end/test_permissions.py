@@ -15,8 +15,6 @@ from kit.folders import comparison
 from kit.robots import calibration_text
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
-pytestmark = pytest.mark.xdist_group("permissions")  # one process makes what these tests share
-
 RUN = "run --plant kinematic --controller constant --set exp2.duration=0.5 --out new"
 LOCKED, HIDDEN = 0o500, 0  # modes of a folder that takes no file, and of what cannot be read
 CASES = {  # call -> (what may not be used, its mode, words of the line)

@@ -29,7 +29,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = [NEEDS_BULLET, pytest.mark.xdist_group("record")]  # it renders what is shown
+pytestmark = NEEDS_BULLET  # it renders what is shown
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
 
 

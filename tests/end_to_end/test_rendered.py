@@ -46,19 +46,3 @@ def test_the_simulators_truth_is_the_models_feature_and_jacobian(open_plant, mod
     np.testing.assert_allclose(plant.truth().feature, model.feature(q), atol=1e-6)
     np.testing.assert_array_equal(plant.truth().jacobian, model.jacobian(q))
     np.testing.assert_allclose(observation.feature, plant.truth().feature, atol=1e-3)
-
-
-def test_a_run_that_is_restored_continues_with_the_same_bits(open_plant):
-    plant, rng = open_plant(), np.random.default_rng(3)
-    plant.reset(1)
-    for _ in range(4):
-        plant.step(Command(rng.uniform(-0.5, 0.5, 6)))
-    state, commands = plant.save(), rng.uniform(-0.5, 0.5, (4, 6))
-    seen = [plant.step(Command(u)) for u in commands]
-    other = open_plant()
-    other.reset(9)
-    other.restore(state)
-    for u, expected in zip(commands, seen, strict=True):
-        observation = other.step(Command(u))
-        np.testing.assert_array_equal(observation.joint_position, expected.joint_position)
-        np.testing.assert_array_equal(observation.feature, expected.feature)

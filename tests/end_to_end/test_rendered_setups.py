@@ -97,18 +97,6 @@ def test_a_hidden_disc_is_lost_alone_and_held(open_setup):
     assert np.isfinite(world.see()).all()
 
 
-def test_a_saved_state_goes_on_with_the_same_bits(open_setup):
-    plant = open_setup(true_model("stereo"), replace(IDEAL, colour_noise=3.0))
-    plant.reset(4)
-    turn = Command(np.full(6, 0.2))
-    plant.step(turn)
-    state = plant.save()
-    first = [plant.step(turn).feature for _ in range(3)]
-    plant.restore(state)
-    np.testing.assert_array_equal(first, [plant.step(turn).feature for _ in range(3)])
-    assert np.std(np.subtract(first, [plant.step(turn).feature for _ in range(3)])) > 0.0
-
-
 def test_what_cannot_be_rendered_is_refused(open_setup):
     model = true_model("pixel")
     with pytest.raises(ValueError, match="the images of pixel have 320 x 240 px and 60 deg"):

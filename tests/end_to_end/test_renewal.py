@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -16,8 +18,10 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, held_out, physical, readme, side_by_side, worlds
-from page_studies.study import Study, nothing, sweep
+from kit.documents import tables as page_tables
+from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
+from page_studies.pictures import README
+from page_studies.study import ENGINES, Study, nothing, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.plan import TUNING, parse_seeds
 from servobench.harness.config.settings import read_settings
@@ -180,9 +184,10 @@ def toy_runs(words):
         {
             "run_id": "-".join(map(str, cell)), "plant": cell[0], "controller": cell[1], "task": cell[2],
             "mismatch": cell[3], "latency_s": float(cell[4]), "period_s": float(cell[5]), "seed": cell[6],
-            "status": "completed", "outcome": "settled",
+            "status": "completed", "outcome": "settled", "sensing": "position",
             **{name: random.uniform(0.5, 1.0) for name in (
                 "settling_time_s", "overshoot", "steady_state_error", "rms_error_evaluated", "rms_error_second_lap",
+                "path_length_ratio", "feature_invalid_fraction",
             )},
         }
         for cell in product(*lists, seeds)
@@ -207,8 +212,8 @@ def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
         "compare", "--plants", "kinematic", "--controllers", "calibrated", "--tasks", "exp2,circle", "--mismatch",
         "none", "--seeds", "0:1", "--no-report", "--workers", "1",
     )  # fmt: skip
-    folder = renewal.carry_out(replace(readme.README, commands={"batch": short}), tmp_path, None, [], keep=False)
-    for name, content in readme.pictures(folder):
+    folder = renewal.carry_out(replace(README, commands={"batch": short}), tmp_path, None, [], keep=False)
+    for name, content in pictures.readme_pictures(folder).items():
         path = tmp_path / Path(name).name
         path.write_bytes(content)
         assert path.stat().st_size < 300e3
@@ -232,7 +237,7 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
     assert {path.name for path in (out / "figures").iterdir()} == {
         "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
     }  # fmt: skip
-    shown = dict(STUDIES["robustness"].files(out.parent))
+    shown = STUDIES["robustness"].files(out.parent)
     assert set(shown) == {"pictures/robustness.png", "pictures/robustness_settling.png"}
     assert all(len(content) < 300e3 for content in shown.values())
 
@@ -261,10 +266,10 @@ def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
 
     def bold(*both):
         pairs = [("changed", "usual")]
-        found = dict(zip(side_by_side.ENGINES, both, strict=True))
-        (cells,) = side_by_side.differences(found, pairs, metric="settling_time_s", never=10.0)
-        assert len({cell.startswith("**") for cell in cells.values()}) == 1
-        return cells["bullet"].startswith("**")
+        found = dict(zip(ENGINES, both, strict=True))
+        (shown,) = cells.MOVES.on_engines(found, pairs)
+        assert len({cell.startswith("**") for cell in shown.values()}) == 1
+        return shown["bullet"].startswith("**")
 
     spread = 0.1 * np.sin(robots)
     later, earlier, alike = (runs(usual=1.0, changed=1.0 + shift + spread) for shift in (0.5, -0.5, 0.0))
@@ -281,3 +286,20 @@ def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
     page = toy / "page.md"
     page.write_text("<!-- table: nothing -->\n\nas it was\n\n<!-- end -->\n")
     assert generated_tables.renewed(page) == page.read_text()
+
+
+def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
+    command = [sys.executable, "benchmarks/page.py", "--quick", "--out", tmp_path, "--only", "limits", "shares"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "performance.md").read_text(encoding="utf-8")
+    limits, shares = (rows for _, _, rows in page_tables(page))
+    assert limits[-1][0] == "the package, a block of 4"
+    sides = {row[0] for row in shares}
+    assert sides == {"single runs", "side by side"}
+    assert len(shares) == 10
+    for row in shares:
+        parts, whole = map(float, row[2:-1]), float(row[-1])
+        assert abs(sum(parts) - whole) < 0.5
+    assert "(pictures/performance_shares.png)" in page
+    assert (tmp_path / "pictures" / "performance_shares.png").stat().st_size < 100e3

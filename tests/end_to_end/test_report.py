@@ -17,8 +17,6 @@ from servobench.harness.pictures import report
 from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = pytest.mark.xdist_group("report")  # one process makes what these tests share
-
 needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
 

@@ -15,10 +15,7 @@ from servobench.harness.batch import results
 from servobench.harness.pictures import report
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
-pytestmark = [
-    pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser"),
-    pytest.mark.xdist_group("report_page"),
-]
+pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
 WIDTHS = (390, 1024, 1600)
 SMALLEST_TYPE = TEXT - 2.0  # [pt]

@@ -1,4 +1,4 @@
-"""Other robots in the plants that are compiled and rendered, and in pictures."""
+"""Other robots in the plants that are compiled and rendered, by `servobench fmu …`, and in pictures."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import pytest
 from kit.command import servobench
 from kit.plants import NEEDS_BULLET
 from kit.robots import FOUR_JOINTS, calibration_text
-from servobench.fmus.inspection import validate_fmu
+from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
@@ -41,7 +42,20 @@ def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(monkeypatch, 
     assert servobench(monkeypatch, "fmu", "info", str(path)) == 0
     shown = capsys.readouterr().out
     assert "Panda with mismatched kinematics" in shown
+    assert "capabilities in co-simulation: canNotUseMemoryManagementFunctions, canGetAndSet" in " ".join(shown.split())
     assert "joint_offset[7]" in shown
+    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 0
+    assert "no problem found" in capsys.readouterr().out
+
+
+def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(monkeypatch, tmp_path):
+    path = tmp_path / "ur5.fmu"
+    arguments = "--fmi", "3", "--mismatch", "severe", "--seed", "3", "-o", str(path)
+    assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
+    start = {variable.name: variable.start for variable in read_information(path).description.modelVariables}
+    run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
+    exported = np.array(start["joint_offset"].split(), dtype=float)
+    np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["panda", "four", "ur10e"])

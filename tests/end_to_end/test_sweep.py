@@ -16,8 +16,6 @@ from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = pytest.mark.xdist_group("sweep")  # one process makes what these tests share
-
 SWEEP = (
     "sweep", "--controllers", "constant,broyden", "--vary", "camera_rotation=0:40:20deg", "--noise", "1,2",
     "--seeds", "4", "--workers", "2", "--set", "random.duration=2",

@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 import pytest
 
-from kit.foreign_fmu import build_crane, describe_exchange
+from kit.foreign_fmu import build_crane, describe_exchange, mapping
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
 from servobench.fmus.export import default_actuation
@@ -22,23 +22,19 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
-from servobench.plant.fmu.model_exchange import FmuModel
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.description import read_description
+from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.fmu.model_exchange import FmuModel, build_model
 from servobench.plant.fmu.world import fmu_entry
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
 
 TRUE_ARM, NOMINAL_ARM = (0.6, 0.3), (0.55, 0.4)
-MAPPING = """
-file = "crane.fmu"
-inputs = ["push.slew", "push.luff"]
-features = ["place.slew", "place.luff"]
-joints = ["wheel.slew", "wheel.luff"]
-[parameters]
-"arm.slew" = 0.6
-"arm.luff" = 0.3
-[limits]
-max_joint_speed = 2.0
+MAPPING = f"""{mapping(2)}
+parameters = {{"arm.slew" = 0.6, "arm.luff" = 0.3}}
+limits = {{max_joint_speed = 2.0}}
 """
 NOMINAL = '[nominal]\n"arm.slew" = 0.55\n"arm.luff" = 0.4\n'
 STATES = '[truth]\nstates = ["wheel.slew", "wheel.luff"]\n'
@@ -77,9 +73,15 @@ def quiet(path: Path) -> Settings:
     return Settings({"target": TARGET, f"fmu:{path}": plant, "nmpc_calibrated": bound})
 
 
+def ur5_model(version: int, parameters=None, joints=("joint_position",)) -> FmuModel:
+    path = cached_fmu(version)
+    mapping = FmuMapping(path, ("joint_velocity_command",), ("ball_position",), joints, parameters=parameters or {})
+    return build_model(mapping, read_description(path, extract_fmu(path)))
+
+
 def test_casadi_reads_the_equations_of_the_ur5_back():
     parameters = parameters_of(mismatched("severe"), default_actuation())
-    model = FmuModel(cached_fmu(2), parameters=parameters)
+    model = ur5_model(2, parameters)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
     np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)
     np.testing.assert_allclose(model.feature(q[0]), mismatched("severe").feature(q[0]), rtol=0, atol=1e-9)
@@ -132,6 +134,7 @@ def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_ar
     assert steps["jacobian_error"].notna().sum() > 20
 
 
+@pytest.mark.slow
 def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     path = mapped(tmp_path, MAPPING + NOMINAL)
     experiment = build_experiment(request(path, "constant"), quiet(path))
@@ -204,6 +207,6 @@ def test_a_mapping_whose_models_do_not_fit_is_one_clear_line(tmp_path, text, mes
 
 def test_an_fmu_of_fmi_3_is_told_by_its_version():
     with pytest.raises(ValueError, match=r"is of FMI 3.0, so its Jacobian cannot be read; wanted FMI 2 with model"):
-        FmuModel(cached_fmu(3))
-    with pytest.raises(ValueError, match="joints names 'elbow', which is none of the states of ur5.*: joint_position"):
-        FmuModel(cached_fmu(2), joints=("elbow",))
+        ur5_model(3)
+    with pytest.raises(ValueError, match=r"joints names 'home\[1\]', which is none of the states of ur5.*: joint_pos"):
+        ur5_model(2, joints=("home",))

@@ -204,8 +204,7 @@ def test_an_empty_name_is_no_plant(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("servobench: unknown plant ''")
 
 
-def test_a_plant_is_named_on_every_command_that_takes_one(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+def test_a_plant_is_named_on_every_command_that_takes_one(no_figures, tmp_path, monkeypatch, capsys):
     write(tmp_path, CONFIGURED_CELL, "cell.py")
     assert command(monkeypatch, "plants", "./cell.py", "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["setting"] == "Cell.speed"

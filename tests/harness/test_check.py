@@ -89,6 +89,7 @@ def test_a_whole_controller_passes_every_check(tmp_path, text):
     assert str(report).startswith("Mine:\nok     constructor\nok     command\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KILLING)
 def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(tmp_path, monkeypatch, capsys, kind):
     write(tmp_path, KILLERS, "kill.py")

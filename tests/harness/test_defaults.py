@@ -9,10 +9,9 @@ import pytest
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import survey
-from servobench.harness.config import defaults
-from servobench.harness.config.defaults import default_config, tuned_file
+from servobench.harness.config import settings as defaults
 from servobench.harness.config.registry import controller_names, find_controller
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config, tuned_file
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections
 from servobench.plant.contract.faults import ConfigurationError

@@ -38,6 +38,7 @@ def assert_same(found, wanted):
         np.testing.assert_equal(flatten(found[name]), flatten(config))
 
 
+@pytest.mark.slow
 def test_a_file_of_everything_reads_back_to_the_same_settings(tmp_path):
     names = PLANTS, (*controller_names(), "mfac+rls"), tuple(TASKS)
     wanted = sections(*names)

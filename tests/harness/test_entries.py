@@ -11,8 +11,8 @@ import servobench
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.batch import trials
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered
+from servobench.harness.config.settings import default_config
 from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
@@ -188,6 +188,7 @@ BROKEN = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(tmp_path, monkeypatch, capsys, what):
     text, message = BROKEN[what]
@@ -258,6 +259,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "why"), HARMFUL.items())
 def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypatch, capfd, line, why):
     monkeypatch.setattr(trials, "IMPORT_LIMIT", 2.0)

@@ -44,10 +44,9 @@ ENTRIES = (
 
 
 @pytest.fixture
-def call(monkeypatch, tmp_path):
+def call(monkeypatch, tmp_path, no_figures):
     """Return a function that runs a command in an empty folder and returns its exit code; it draws nothing."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
     with offering([own_object(CONTROLLER, each) for each in ENTRIES]):
         yield partial(servobench, monkeypatch)
 

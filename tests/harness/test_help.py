@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kit.command import servobench
 from servobench.harness.cli.main import PANELS, app, command_line
-from servobench.harness.cli.options import ABSENT, Value, command, option
+from servobench.harness.cli.options import ABSENT, Value, command, named_option
 
 ROOT = command_line()
 COMMANDS = [
@@ -106,7 +106,7 @@ def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
 COLOUR = Value("COLOUR", lambda incomplete: [incomplete + "ed"], lambda text: 2 * text)
 
 
-def paint(*, shade: Annotated[str, option("--colour", COLOUR, "Shade of it.", {"wash": "no paint"})] = "blue"):
+def paint(*, shade: Annotated[str, named_option("--colour", COLOUR, "Shade of it.", {"wash": "no paint"})] = "blue"):
     typer.echo(shade)
 
 

@@ -24,8 +24,6 @@ from servobench.harness.config.settings import Settings
 from servobench.plant.contract.checksums import SUMS, fault, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
-pytestmark = pytest.mark.xdist_group("integrity")  # one process makes what these tests share
-
 RUNS = 24
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kit.toy import plant_spec
-from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from kit.toy import TRAINING, plant_spec
 from servobench.controllers.networks.fit import train
 from servobench.harness.run import knowledge as network_cache
 from servobench.harness.run.knowledge import NETWORKS, network_source
@@ -14,12 +13,6 @@ from servobench.plant.contract import cache
 from servobench.plant.contract.cache import cache_folder
 
 SPEC = plant_spec(2, 2)
-CONFIG = TrainingConfig(
-    (0.5, 0.5),
-    (1.5, 1.5),
-    jacobian=JacobianTraining(centres=8, samples=60),
-    controller=ControllerTraining(hidden=4, samples=60),
-)
 
 
 def planar_jacobian(q):
@@ -48,14 +41,14 @@ def obtain(factor: float = 1.0):
     """Return the networks as a new process gets them."""
     network_cache._KEPT.clear()
     cache._verified.clear()
-    return network_source(lambda q: factor * planar_jacobian(q), SPEC)(CONFIG)
+    return network_source(lambda q: factor * planar_jacobian(q), SPEC)(TRAINING)
 
 
 def test_the_cache_trains_once_for_each_configuration_and_model(trainings):
     first, second = obtain(), obtain()
     assert len(trainings) == 1
     np.testing.assert_array_equal(first.controller.weights, second.controller.weights)
-    np.testing.assert_array_equal(first.jacobian.weights, train(CONFIG, planar_jacobian, SPEC).jacobian.weights)
+    np.testing.assert_array_equal(first.jacobian.weights, train(TRAINING, planar_jacobian, SPEC).jacobian.weights)
     obtain(1.1)
     assert len(trainings) == 2
 
@@ -75,10 +68,9 @@ def test_a_damaged_file_is_trained_again_and_blocks_nobody(damage, trainings):
 def test_a_results_folder_that_takes_no_copy_fails_no_run(trainings, tmp_path):
     full = tmp_path / "out"
     full.write_text("no folder, so that nothing can be written below it")
-    networks = network_source(planar_jacobian, SPEC, keep=full)(CONFIG)
+    networks = network_source(planar_jacobian, SPEC, keep=full)(TRAINING)
     assert len(trainings) == 1
     full.unlink()
-    assert (
-        network_source(planar_jacobian, SPEC, keep=full)(CONFIG).digest == networks.digest
-    )  # the next run tries again
+    again = network_source(planar_jacobian, SPEC, keep=full)(TRAINING)  # the next run tries again
+    assert again.digest == networks.digest
     assert len(list((full / NETWORKS).glob("*.npz"))) == 1

@@ -1,6 +1,6 @@
-"""Plants and controllers in any order of reset, step, save, restore, keep and close: a run is where it is.
+"""Plants in any order of reset, step, save, restore, keep and close: a run is where it is.
 
-A run of a seed has one observation after k periods, however it got there: each machine remembers the bits of that and
+A run of a seed has one observation after k periods, however it got there: the machine remembers the bits of that and
 demands them again.
 """
 
@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
     initialize,
-    invariant,
     precondition,
     rule,
     run_state_machine_as_test,
@@ -21,9 +20,6 @@ from hypothesis.stateful import (
 
 from kit.plants import configure, mismatched
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_experiment
-from servobench.harness.run.request import RunRequest
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract import lanes
 from servobench.plant.contract.signals import Command
@@ -101,83 +97,8 @@ class PlantLife(RuleBasedStateMachine):
             self.plant.close()
 
 
-class LoopLife(RuleBasedStateMachine):
-    """A controller in closed loop with a plant."""
-
-    plant: str
-    controller: str
-    seen: dict[tuple[int, int], bytes]
-
-    @initialize()
-    def build(self) -> None:
-        self.saved = []
-        request = RunRequest(self.plant, self.controller, "circle", "moderate", 0)
-        self.experiment = build_experiment(request, Settings())
-        run = self.experiment.run
-        self.desired = self.experiment.scenario.reference.sampled(run.period, MAX_PERIODS + run.preview_rows + 1)
-        self.reset(0)
-
-    @rule(seed=st.integers(0, 1))
-    def reset(self, seed: int) -> None:
-        self.seed, self.k = seed, 0
-        self.observation = self.experiment.plant.reset(seed)
-        self.experiment.controller.reset(self.observation, seed)
-
-    @rule(count=st.integers(1, 4))
-    def step(self, count: int) -> None:
-        for _ in range(min(count, MAX_PERIODS - self.k)):
-            ahead = self.desired[self.k : self.k + 1 + self.experiment.run.preview_rows]
-            command = self.experiment.controller.step(self.observation, ahead)
-            self.observation = self.experiment.plant.step(command)
-            self.k += 1
-
-    @invariant()
-    def has_the_bits_of_its_period(self) -> None:
-        if hasattr(self, "observation"):
-            shown = bits(self.observation.joint_position, self.observation.feature)
-            assert self.seen.setdefault((self.seed, self.k), shown) == shown
-
-    @rule()
-    def save(self) -> None:
-        parts = self.experiment.plant.save(), self.experiment.controller.save()
-        self.saved.append((*parts, self.observation, self.k, self.seed))
-
-    @precondition(lambda self: self.saved)
-    @rule(data=st.data())
-    def restore(self, data) -> None:
-        plant, controller, self.observation, self.k, self.seed = data.draw(st.sampled_from(self.saved))
-        self.experiment.plant.restore(plant)
-        self.experiment.controller.restore(controller)
-
-    @rule()
-    def close_and_build(self) -> None:
-        self.experiment.plant.close()
-        self.build()
-
-    def teardown(self) -> None:
-        if hasattr(self, "experiment"):
-            self.experiment.plant.close()
-
-
 @pytest.mark.parametrize("name", ["kinematic", "fmu"])
 def test_runs_of_a_plant_are_where_they_are(name):
     machine = type("PlantLifeOf" + name, (PlantLife,), {"name": name, "seen": {}})
-    run_state_machine_as_test(machine, settings=FEW)
-    assert machine.seen
-
-
-@pytest.mark.parametrize(
-    ("plant", "controller"),
-    [
-        ("kinematic", "ukf_mfac"),
-        ("fmu", "rls"),
-        ("kinematic", "ukf_mpc"),
-        ("fmu", "map_mfac"),
-        ("kinematic", "rbfnn_mfac"),
-        ("kinematic", "nmpc_calibrated"),
-    ],
-)
-def test_a_closed_loop_is_where_it_is(plant, controller):
-    machine = type("LoopLifeOf" + plant, (LoopLife,), {"plant": plant, "controller": controller, "seen": {}})
     run_state_machine_as_test(machine, settings=FEW)
     assert machine.seen

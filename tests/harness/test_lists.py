@@ -106,8 +106,7 @@ def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_we
     assert join_words([*words, "after"], len(words) - 1) == (joined, before)
 
 
-def test_a_run_takes_its_controller_first(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+def test_a_run_takes_its_controller_first(no_figures, monkeypatch, capsys, tmp_path):
     short = ("--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out"))
     assert servobench(monkeypatch, "run", "constant", *short) == 0
     assert load_runs(tmp_path / "out")["run_id"].tolist() == ["kinematic-constant-exp2-moderate-0"]

@@ -164,6 +164,7 @@ def test_a_frozen_controller_is_identified_as_it_is_linearised():
     assert margins.gain == pytest.approx(wanted.gain, rel=0.01)
 
 
+@pytest.mark.slow
 def test_an_identified_loop_has_the_margins_and_the_step_of_the_linearised_one():
     run = resolved("pid+true", law={"integral_gain": 0.7})
     linear, identified = (analyse_loop(run, identify=each) for each in (False, True))

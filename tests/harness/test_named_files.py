@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import servobench
+from kit.own import WHOLE
 from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import offering
@@ -15,25 +16,9 @@ from servobench.harness.config.source import neighbours
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
 
-MINE = """
-import helper
-from laws import gain
-from servobench import Command, Controller
-
-
-class Mine(Controller):
-    def __init__(self, knowledge):
-        self.n = knowledge.spec.n
-
-    def reset(self, observation, seed):
-        pass
-
-    def step(self, observation, reference):
-        return Command([gain.VALUE * helper.SPEED] * self.n)
-
-    def diagnostics(self):
-        return {}
-"""
+MINE = "import helper\nfrom laws import gain\n" + WHOLE.replace(
+    "np.zeros(self.n)", "np.full(self.n, gain.VALUE * helper.SPEED)"
+)
 CODE = {"mine.py": MINE, "helper.py": "SPEED = 0.01\n", "laws/__init__.py": "", "laws/gain.py": "VALUE = 1.0\n"}
 WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0.4,0.1,1.2\n1,0.4,0.0,1.2\n"
 SHORT = {"exp1": {"duration": 0.2}}

@@ -16,6 +16,7 @@ def _own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "check"), [("controller", "check"), ("plant", "check plant")])
 def test_a_new_file_passes_its_own_test(monkeypatch, capsys, tmp_path, kind, check):
     assert servobench(monkeypatch, "new", kind, "my_law", "--folder", "laws") == 0

@@ -256,6 +256,7 @@ def read_steps(folder):
     error_curves(folder, runs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "read"), [(results.RUNS, read_runs), (results.STEPS, read_steps)])
 def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_one_line(tmp_path, kind, read):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "rls"), tasks=("exp1", "circle"))
@@ -316,6 +317,7 @@ def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(monkeypatch, capsy
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("export", "--out", "FILES"), ("report",), ("statistics",), ("verify",)])
 def test_commands_first_say_how_many_runs_of_a_batch_are_missing(monkeypatch, capsys, tmp_path, command):
     folder = tmp_path / "out"

@@ -11,9 +11,8 @@ import pytest
 from kit.command import judged
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
-from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
@@ -93,6 +92,7 @@ def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
         resolve(PANDA, Settings())
 
 
+@pytest.mark.slow
 def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
     experiment = build_experiment(request, Settings())

@@ -19,6 +19,7 @@ from servobench.harness.studies.robustness import (
     LINES,
     MOVE,
     Line,
+    batch_of_map,
     draw_map,
     find_lines,
     map_cells,
@@ -32,7 +33,7 @@ from servobench.plant.robot.mismatch import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
-    usual, moved = map_cells("kinematic", ["constant", "broyden"], [0, 1, 2])
+    usual, moved = map_cells(batch_of_map("kinematic", ["constant", "broyden"], [0, 1, 2]))
     cells = [*usual, *moved]
     assert len({cell.request.run_id for cell in usual}) == len(usual)
     assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
@@ -47,7 +48,7 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
 def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
     lines = find_lines(["jitter", "outliers"])
     assert [line.axis for line in lines] == ["outliers", "jitter"]
-    static, moved = map_cells("kinematic", ["constant"], [0], lines=lines)
+    static, moved = map_cells(batch_of_map("kinematic", ["constant"], [0]), lines)
     assert len(moved) == 0
     assert {str(cell.request.mismatch) for cell in static} >= {"moderate+outliers=40%", "moderate+jitter=200ms"}
     assert find_lines([]) is LINES
@@ -96,6 +97,7 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
     assert upright == [pytest.approx(1000.0 * limits["pid+true"])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "predicted"), [("kinematic", ["constant"]), pytest.param("mujoco", [], marks=NEEDS_MUJOCO)]
 )
@@ -139,12 +141,12 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
 
 
 def test_a_map_of_pixels_has_them_at_every_place():
-    usual, moved = map_cells("kinematic", ["constant"], [0], sensing="stereo:hand")
+    usual, moved = map_cells(batch_of_map("kinematic", ["constant"], [0], sensing="stereo:hand"))
     assert {cell.request.sensing for cell in [*usual, *moved]} == {"stereo:hand"}
 
 
 def test_the_map_of_another_arm_has_its_runs_and_its_prediction():
-    usual, moved = map_cells("kinematic", ["constant"], [0], "panda")
+    usual, moved = map_cells(batch_of_map("kinematic", ["constant"], [0], "panda"))
     assert {cell.request.robot for cell in [*usual, *moved]} == {"panda"}
     fast = Settings({"pid+constant": {"law": {"proportional_gain": 9.0}}})
     limits = [predicted_limits(["pid+constant"], fast, robot)["pid+constant"] for robot in ("ur5", "panda")]

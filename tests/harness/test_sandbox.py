@@ -19,6 +19,7 @@ from servobench.harness.batch.sandbox import Pool, Task
 from servobench.plant.contract.faults import ConfigurationError
 
 
+@pytest.mark.slow
 def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(tmp_path, monkeypatch):
     (tmp_path / "slow_import.py").write_text("import time\n\ntime.sleep(60.0)\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -56,6 +57,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_stopped_ends_with_the_process_that_started_it(tmp_path):
     (tmp_path / "killed.py").write_text(STOPPED)
     path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
@@ -79,6 +81,7 @@ def harm(how: str, tell) -> None:
         os._exit(3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "end"),
     [

@@ -208,6 +208,7 @@ def test_a_run_of_a_plate_has_its_true_pose_error_in_both_tables():
     assert "pose_error_mm" not in run_experiment(request("position"), Settings({})).row
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", PIXEL_WORDS[1:4])
 def test_runs_side_by_side_are_those_of_single_runs(word):
     runs = [resolve(request(word, seed=seed), Settings({})) for seed in (0, 1)]
@@ -249,6 +250,7 @@ def test_a_plant_may_have_the_position_only(monkeypatch):
         build(resolve(request("pixel"), Settings({})))
 
 
+@pytest.mark.slow
 def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):
     file = tmp_path / "four.toml"
     file.write_text(FOUR_JOINTS)

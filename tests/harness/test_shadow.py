@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from kit.broken_controllers import stepping
 from kit.command import servobench
 from servobench import compare
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
@@ -19,25 +20,13 @@ SECTIONS = {
     "ukf_mfac": {"law": {"gain": 2.0}},
 }
 
-
-PROPORTIONAL = """
-import numpy as np
-from servobench import Command, Controller
-
-
-class Proportional(Controller):
-    def __init__(self, knowledge):
-        self.n = knowledge.spec.n
-
-    def reset(self, observation, seed):
-        self.steps = 0
-
-    def step(self, observation, reference):
-        self.steps += 1
-        u = np.zeros(self.n)
-        u[:3] = 0.1 * (reference[-1] - observation.feature) + 0.001 * self.steps
-        return Command(u)
-"""
+PROPORTIONAL = stepping(
+    "self.steps += 1",
+    "u = np.zeros(self.n)",
+    "u[:3] = 0.1 * (reference[-1] - observation.feature) + 0.001 * self.steps",
+    "return servobench.Command(u)",
+    reset="self.steps = 0",
+)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import servobench
 from kit.command import judged
 from kit.command import servobench as command
 from kit.documents import blocks
-from kit.own import write
+from kit.own import install, write
 from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
@@ -41,6 +41,7 @@ def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path
     np.testing.assert_allclose(np.hypot(*reached[:2]), 0.1, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_file(tmp_path):
     write(tmp_path, SPIRAL, "spiral.py")
     tables = [
@@ -54,7 +55,7 @@ def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_fil
     assert "spiral.py" in " ".join(manifest["files"])
 
 
-def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(tmp_path, monkeypatch, capsys):
+def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(no_figures, tmp_path, monkeypatch, capsys):
     write(tmp_path, SPIRAL, "spiral.py")
     assert command(monkeypatch, "tasks", "./spiral.py") == 0
     assert "Spiral.radius = 0.1" in capsys.readouterr().out
@@ -102,14 +103,8 @@ def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_p
 
 
 def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
-    write(tmp_path, SPIRAL, "spirals.py")
-    information = tmp_path / "spirals-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: spirals\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text(
-        "[servobench.tasks]\nspiral = spirals:Spiral\ncircle = spirals:Spiral\nlost = spirals:Lost\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
+    points = "[servobench.tasks]\nspiral = spirals:Spiral\ncircle = spirals:Spiral\nlost = spirals:Lost\n"
+    monkeypatch.syspath_prepend(install(tmp_path, "spirals", SPIRAL, points))
     for function in (registry._points, registry._load):
         function.cache_clear()
     try:

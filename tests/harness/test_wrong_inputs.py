@@ -146,9 +146,9 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("record", "--plant", "kinematic", "--set", "bullet.lag=1"), "'bullet' does not run here"),
     # studies and tools
     (("analyse", "mfac"), "it is a law and makes a pair"),
-    (("analyse", "pid+true", "--jacobian", "tru"), "--jacobian must be one of true, nominal, estimated, got 'tru'"),
+    (("analyse", "pid+true", "--jacobian", "tru"), "'tru' is not one of 'true', 'nominal', 'estimated'"),
     (("robustness", "--out", "new", "--plant", "kinematic", "--set", "exp2.duration=3"), "'exp2' does not run here"),
-    (("claims", "--out", "new", "--division", "equiped"), "got 'equiped'; did you mean 'equipped'?"),
+    (("claims", "--out", "new", "--division", "equiped"), "'equiped' is not one of 'equipped', 'published'"),
     (("claims", "--out", "new", "--seeds", "2"), "--seeds must be at least 6"),
     (("claims", "--out", "new", "--check", "none.csv"), "none.csv"),
     (("tune", "--controllers", "ukf_mfa"), "ukf_mfac"),

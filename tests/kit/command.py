@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
+import psutil
 import pytest
 
 from servobench.harness.batch import results
@@ -39,6 +40,18 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
     """Wait for a process and return its exit code and what it wrote to standard output and error."""
     output, errors = process.communicate(timeout=300)
     return process.returncode, output + errors
+
+
+def left_behind(mark: str, value: str) -> list[str]:
+    """Return the command lines of the processes whose environment has a value for a mark."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get(mark) == value and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(" ".join(process.cmdline()))
+        except psutil.Error:
+            continue
+    return found
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

@@ -1,10 +1,7 @@
-"""Exported controllers: each is recorded once, and compiled once for a version of FMI."""
+"""Exported controllers: each is compiled once for a version of FMI, by whichever process needs it first."""
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -18,6 +15,7 @@ from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.plant.contract.cache import cached
 from servobench.plant.contract.signals import Command, Observation
 
 PERIODS = 120
@@ -34,16 +32,12 @@ def recorded(name: str) -> ControllerModel:
 @cache
 def exported(name: str, version: int) -> Path:
     """Return a controller as an FMU."""
-    return (
-        recorded(name).product(version).write(_folder() / f"{name.replace(':', '_')}_{version}.fmu", (this_platform(),))
-    )
+    file = f"{name.replace(':', '_')}_{version}"
 
+    def make(folder: Path) -> None:
+        recorded(name).product(version).write(folder / f"{file}.fmu", (this_platform(),))
 
-@cache
-def _folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="servobench-tests-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+    return cached("controllers_of_tests", file, make) / f"{file}.fmu"
 
 
 def experiment(name: str, **settings: object) -> Experiment:

@@ -9,6 +9,7 @@ error.
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import subprocess
 import tempfile
@@ -20,6 +21,13 @@ from servobench.fmus.compiler import this_platform
 
 SOURCES = Path(__file__).parent / "foreign_fmu_sources"
 STARTS = {"push": (0.0, 0.0), "arm": (0.5, 0.4)}
+ROLES = {  # names of variables by role, of each version
+    version: {
+        role: tuple(f"{name}{part}" for part in parts)
+        for role, name in (("inputs", "push"), ("joints", "wheel"), ("features", "place"))
+    }
+    for version, parts in ((2, (".slew", ".luff")), (3, ("",)))
+}
 SCALARS = [("wheel", 10, "output"), ("push", 20, "input"), ("place", 30, "output"), ("arm", 40, "parameter")]
 
 
@@ -41,6 +49,13 @@ def describe_exchange(derivatives: bool = True) -> str:
         "</ModelVariables>", f"{rates}</ModelVariables>"
     )
     return text.replace("<ModelStructure/>", f"<ModelStructure>{structure}</ModelStructure>")
+
+
+def mapping(version: int) -> str:
+    """Return the mapping of `crane.fmu` in TOML."""
+    return "\n".join(
+        ['file = "crane.fmu"', *(f"{role} = {json.dumps(names)}" for role, names in ROLES[version].items()), ""]
+    )
 
 
 def _unknown(index: int) -> str:

@@ -56,7 +56,7 @@ def install(folder: Path, module: str, text: str, points: str) -> Path:
         points: lines of entry_points.txt.
     """
     info = folder / f"{module}-1.0.dist-info"
-    info.mkdir(parents=True)
+    info.mkdir(parents=True, exist_ok=True)
     write(folder, text, f"{module}.py")
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(points)

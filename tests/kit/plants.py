@@ -23,8 +23,8 @@ NEEDS = {"bullet": NEEDS_BULLET, "mujoco": NEEDS_MUJOCO}
 
 
 def plant_parameters(names):
-    """Return names of plants as parameters of a test, each skipped where its packages are not installed."""
-    return [pytest.param(name, marks=NEEDS[name]) if name in NEEDS else name for name in names]
+    """Return names of plants as parameters of a test; rendered ones are slow, and skipped where they cannot run."""
+    return [pytest.param(name, marks=[NEEDS[name], pytest.mark.slow]) if name in NEEDS else name for name in names]
 
 
 ALL_PLANTS = plant_parameters(plant_names())

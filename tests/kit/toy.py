@@ -9,12 +9,19 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 from servobench.controllers.stages.finish import Finish
 from servobench.plant.contract.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
+TRAINING = TrainingConfig(  # of the smallest networks of a plant of two joints
+    (0.5, 0.5),
+    (1.5, 1.5),
+    jacobian=JacobianTraining(centres=8, samples=60),
+    controller=ControllerTraining(hidden=4, samples=60),
+)
 
 
 def plant_spec(n, m, speed=1.0, reach=6.0):

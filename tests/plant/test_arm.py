@@ -1,19 +1,24 @@
+import casadi
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from kit.plants import factory_ur5, nominal_ur5
+from servobench.fmus.export import arm_layout
+from servobench.fmus.sources import core_functions
+from servobench.fmus.variables import Actuation, parameters_of
+from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.arm import (
-    CALIBRATION_BLOCKS,
     SerialArm,
-    arm_from_calibration,
     arm_from_dh,
     arm_from_modified_dh,
     rotation_from_rpy,
     rpy_from_rotation,
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
 from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, ur5_arm
 
 
@@ -73,6 +78,39 @@ def test_jacobian_equals_central_differences(arm):
         steps = h * np.eye(6)
         numeric = (model.feature(q + steps) - model.feature(q - steps)).T / (2 * h)
         np.testing.assert_allclose(model.jacobian(q), numeric, atol=1e-9)
+
+
+def random_model(seed, n=6):
+    rng = np.random.default_rng(seed)
+    arm = SerialArm(
+        tuple(f"joint_{i}" for i in range(n)),
+        rng.uniform(-0.5, 0.5, (n + 1, 3)),
+        rng.uniform(-np.pi, np.pi, (n + 1, 3)),
+        rng.uniform(-0.3, 0.3, n),
+        rng.uniform(0.8, 1.2, n),
+        rng.uniform(-0.2, 0.2, 3),
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    pose[:3, 3] = rng.uniform(-1.0, 1.0, 3)
+    return HandEyeModel(arm, pose)
+
+
+@pytest.mark.parametrize(
+    "model", [nominal_ur5(), *(random_model(seed, n) for seed, n in enumerate((6, 6, 6, 2, 3, 7, 8)))]
+)
+def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
+    n, layout = model.arm.n, arm_layout(model.arm.n)
+    q, values = casadi.SX.sym("q", n), parameters_of(model, Actuation(0.05, 1.0, 2 * np.pi, np.zeros(n)))
+    p = casadi.DM(np.concatenate([np.ravel(values[group.name]) for group in layout.kinematic]))
+    exported_feature, exported_jacobian, _ = core_functions(layout)
+    feature = symbolic_feature(model)(q)
+    outputs = [feature, casadi.jacobian(feature, q), exported_feature(q, p)[:3], exported_jacobian(q, p)]
+    function = casadi.Function("all", [q], outputs)
+    for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, n)):
+        y, J, exported_y, exported_J = (np.asarray(value) for value in function(pose))
+        np.testing.assert_allclose([y, exported_y], [model.feature(pose)[:, None]] * 2, rtol=0, atol=1e-12)
+        np.testing.assert_allclose([J, exported_J.reshape(3, n)], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12)
 
 
 def test_rotations_are_rotations_in_the_urdf_order():
@@ -156,7 +194,7 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(ValueError, match=f"calibration.yaml .*{message}|{message} .*calibration.yaml") as caught:
-        arm_from_calibration(path, TOOL, JOINT_NAMES)
+        read_calibration(path, TOOL)
     assert "\n" not in str(caught.value)
 
 

@@ -18,6 +18,15 @@ def test_a_ray_times_its_depth_is_the_point_that_was_projected():
     np.testing.assert_allclose(CAMERA.rays(columns, rows) * p[:, 2:], p, atol=1e-12)
 
 
+@pytest.mark.parametrize("height", [0.15, 0.25, 0.35])
+def test_it_sees_the_circle_of_the_workspace_with_a_margin(height):
+    angle = np.linspace(0, 2 * np.pi, 60)
+    circle = np.column_stack([0.5 + 0.35 * np.cos(angle), 0.35 * np.sin(angle), np.full(60, height)])
+    pixel = CAMERA.project(nominal_ur5().to_camera(circle))
+    assert (pixel > 15).all()
+    assert (pixel < (CAMERA.width - 15, CAMERA.height - 15)).all()
+
+
 def test_the_vertical_field_of_view_spans_the_image():
     assert 2 * np.degrees(np.arctan(0.5 * CAMERA.height / CAMERA.focal)) == pytest.approx(CAMERA.vertical_fov)
 

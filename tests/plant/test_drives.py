@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from servobench.plant.rendered.drives import PHYSICS_STEP, STICKING_SPEED, DriveConfig, Drives, DriveState, RigidBody
+from servobench.plant.rendered.settings import RenderedConfig
 
 FREE = DriveConfig(
     coulomb_friction=(0.0,),
@@ -127,3 +128,8 @@ def test_a_list_of_another_length_is_refused():
         DriveConfig(torque_limit=(1.0, 2.0)).check(6)
     with pytest.raises(ValueError, match="must be at least 0"):
         DriveConfig(coulomb_friction=(-1.0,))
+
+
+def test_an_obstacle_that_is_no_box_is_refused():
+    with pytest.raises(ValueError, match="obstacles"):
+        RenderedConfig(obstacles=((0.1, 0.2, 0.3),))

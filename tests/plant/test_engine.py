@@ -17,12 +17,14 @@ def python(program, **streams):
     return subprocess.run([sys.executable, "-c", program], text=True, timeout=120, check=True, **streams)
 
 
+@pytest.mark.slow
 def test_importing_the_engine_prints_nothing():
     program = "import sys; sys.stderr.write('a'); import servobench.plant.rendered.bullet; sys.stderr.write('b')"
     done = python(program, capture_output=True)
     assert (done.stdout, done.stderr) == ("", "ab")
 
 
+@pytest.mark.slow
 def test_the_engine_can_be_imported_without_a_standard_error():
     program = "import os; os.close(2); from servobench.plant.rendered.bullet import pybullet; print(pybullet.DIRECT)"
     assert python(program, stdout=subprocess.PIPE).stdout == "2\n"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.optimize import least_squares
 
 from servobench.plant.contract.lanes import stack
@@ -29,17 +30,19 @@ def arms(count: int) -> list[SerialArm]:
     return [sample_mismatch(Mismatch.parse("severe"), find_robot("ur5"), seed)[0].arm for seed in range(count)]
 
 
+@pytest.mark.slow
 def test_the_distance_is_that_of_scipy_in_and_out_of_reach():
-    points = np.random.default_rng(3).uniform(-1.2, 1.2, (10, 3))
+    points = np.random.default_rng(3).uniform(-1.2, 1.2, (6, 3))
     for arm in arms(2):
         wanted = np.array([oracle(arm, point, -TURN, TURN) for point in points])
         assert 0 < np.count_nonzero(wanted > BAND) < len(points)
         np.testing.assert_allclose(closest_distance(arm, points, -TURN, TURN), wanted, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_narrow_joint_limits_put_the_same_points_out_of_reach_as_for_scipy():
     arm = arms(1)[0]
-    points = arm.ball_position(np.array(HOME) + np.random.default_rng(4).uniform(-1.0, 1.0, (20, 6)))
+    points = arm.ball_position(np.array(HOME) + np.random.default_rng(4).uniform(-1.0, 1.0, (10, 6)))
     wanted = np.array([oracle(arm, point, *NARROW) for point in points])
     assert 0 < np.count_nonzero(wanted > BAND) < len(points)
     got = closest_distance(arm, points, *NARROW)

@@ -222,6 +222,7 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     assert "estimated: torque limits" in read.note
 
 
+@pytest.mark.slow
 def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
     yourdfpy = pytest.importorskip("yourdfpy")
     path = tmp_path / "odd.urdf"
@@ -254,6 +255,7 @@ def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
         find_robot(str(tmp_path / "arm.urdf"))
 
 
+@pytest.mark.slow
 def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
     one, again, other = find_robot("random_arm:1"), random_robot(1), random_robot(0)
     q = np.full(one.n, 0.3)

@@ -11,7 +11,7 @@ import pytest
 
 from kit.robots import FOUR_JOINTS
 from servobench.plant.cameras.model import NEAREST, SetupModel
-from servobench.plant.cameras.optics import CAMERA, Optics, in_image, locate, project
+from servobench.plant.cameras.optics import CAMERA, Optics, in_image, project
 from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
@@ -76,13 +76,6 @@ def test_interaction_matrix_and_motions_of_points_make_the_jacobian_of_casadi(wo
 def test_features_without_an_inverse_have_no_interaction_matrix():
     with pytest.raises(ValueError, match="position has no interaction matrix: single and locate must be given"):
         true_model("position:hand").interaction(np.zeros(3), np.ones((1, 1)))
-
-
-@pytest.mark.parametrize("distortion", [0.0, -0.1, 0.1])
-def test_points_are_found_again_where_they_appear(distortion):
-    optics = Optics(np.array([208.0]), np.array([[163.0, 117.0]]), np.array([distortion]), (320.0, 240.0))
-    points = np.random.default_rng(0).uniform([-0.5, -0.4, 0.9], [0.5, 0.4, 1.5], (20, 1, 4, 3))
-    np.testing.assert_allclose(locate(project(points, optics), points[..., 2], optics), points, atol=1e-6)
 
 
 @pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])

@@ -1,9 +1,12 @@
+from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
-from kit.plants import factory_ur5
+from kit.plants import configure, factory_ur5, setup
+from servobench.plant.rendered.plants import BULLET
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.urdf import (
     arm_mechanics,
     arm_tree,
@@ -179,6 +182,14 @@ def test_rectangles_face_up_and_have_their_area():
     a, b, c = vertices[faces].transpose(1, 0, 2)
     np.testing.assert_allclose(np.cross(b - a, c - a)[:, 2] / 2, [1.0, 1.0, 0.5, 0.5])
     assert (vertices[:, 2] == -0.5).all()
+
+
+def test_a_period_that_physics_does_not_divide_and_a_gear_ratio_of_zero_are_refused():
+    with pytest.raises(ValueError, match=r"period must be a whole multiple of the plant's own step of 0\.001 s"):
+        BULLET.build(configure(RenderedConfig, latency=0.0), setup(period=0.0305))
+    stuck = replace(UR5.nominal, arm=replace(UR5.nominal.arm, gear_ratio=np.eye(6)[0]))
+    with pytest.raises(ValueError, match="gear_ratio must not be zero"):
+        BULLET.build(RenderedConfig(), replace(setup(), model=stuck))
 
 
 def test_an_arm_with_another_number_of_joints_is_refused():

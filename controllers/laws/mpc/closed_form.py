@@ -1,6 +1,6 @@
-"""The integrals a, b, c of eq. 46 and the predictive laws without limits, in closed form.
+"""The horizon of a predictive law in blocks, the integrals a, b, c of eq. 46, and the laws without limits.
 
-Symbols (times τ and horizon H in blocks, see `blocks`; in the paper a block is a control period):
+Symbols (times τ and horizon H in `Blocks`; in the paper a block is a control period):
 
 | here | meaning | shape | unit |
 |---|---|---|---|
@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
+from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import transposed
 
@@ -32,8 +33,7 @@ _MIN_POWER = 1e-150  # [1] smaller weights count as 0, so that products with the
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
-@dataclass(frozen=True, slots=True)
-class HorizonIntegrals:
+class HorizonIntegrals(NamedTuple):
     """a, b and c of eq. 46."""
 
     a: float
@@ -188,3 +188,64 @@ class UnlimitedPlan:
         both = self._back @ (along @ (transposed(V) @ weighted))
         moves = len(self._forth)
         return both[..., :moves, :], both[..., moves:, :]
+
+
+REFERENCE_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """B blocks of length Δ, with B Δ the horizon; a joint step of a block is Δ times its velocity.
+
+    Weights are stated for blocks of Δ₀ = 0.05 s. For others they follow from the integrals over the horizon, of which
+    the sums over the blocks are approximations, so that the optimum in continuous time stays the same:
+
+        Σ ‖error‖² + q Σ ‖step‖²  ≈  (1/Δ) ∫ ‖error‖² dt + q Δ ∫ ‖velocity‖² dt   with q = q₀ (Δ₀ / Δ)²
+
+    Attributes:
+        count: B.
+        length: Δ [s].
+        period: of control [s].
+    """
+
+    count: int
+    length: float
+    period: float
+
+    @classmethod
+    def of(cls, horizon_time: float, moves: int, period: float) -> Blocks:
+        """Return `moves` blocks over `horizon_time` [s], or fewer ones: none is shorter than a control period [s]."""
+        count = max(1, min(moves, int(in_periods(horizon_time, period))))
+        return cls(count, max(horizon_time / count, period), period)
+
+    @property
+    def periods(self) -> float:
+        """Length of a block in control periods."""
+        return in_periods(self.length, self.period)
+
+    @property
+    def relative_length(self) -> float:
+        """Δ / Δ₀."""
+        return in_periods(self.length, REFERENCE_BLOCK)
+
+    def places(self, delay: float) -> FloatArray:
+        """Return the places in a preview of the beginning of the first block and the ends of all, (B + 1,), in rows.
+
+        Args:
+            delay: from now to the begin of the first block [s].
+        """
+        return np.array([in_periods(delay + t * self.length, self.period) for t in range(self.count + 1)])
+
+
+def bridging_shares(delay: float, period: float) -> FloatArray:
+    """Return the share of each of the last steps sent that takes effect after `delay`, the newest one last.
+
+    Args:
+        delay: from a command to its effect [s].
+        period: of control [s].
+    """
+    count = in_periods(delay, period)
+    shares = np.ones(int(np.ceil(count)))
+    if len(shares):
+        shares[0] = count - (len(shares) - 1)
+    return shares

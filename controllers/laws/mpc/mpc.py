@@ -9,9 +9,10 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law, Stage
-from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import (
+    Blocks,
     UnlimitedPlan,
+    bridging_shares,
     decay_shares,
     decay_targets,
     horizon_integrals,

@@ -20,8 +20,8 @@ from typing import Any, Final, final
 
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.config.defaults import default_config, file_stem
 from servobench.harness.config.description import toml
+from servobench.harness.config.settings import default_config, file_stem
 from servobench.harness.studies.tuning.objective import TuningSet, score
 from servobench.harness.studies.tuning.scoring import (
     LEDGER,

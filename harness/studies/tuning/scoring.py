@@ -19,8 +19,7 @@ import numpy as np
 
 from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.config.defaults import apply_settings, default_config, file_stem
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import apply_settings, default_config, file_stem, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective

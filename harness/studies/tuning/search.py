@@ -20,8 +20,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import TPESampler
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.defaults import apply_settings, tuned_settings
-from servobench.harness.config.settings import flatten
+from servobench.harness.config.settings import apply_settings, flatten, tuned_settings
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     Distribution,

@@ -1,4 +1,4 @@
-"""The C sources of exported FMUs, those of a plant and of a controller, as clang-tidy sees them with `.clang-tidy`."""
+"""The C sources of exported FMUs, of a plant and of a controller: in clang-tidy's eyes, and under the sanitizers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from kit.controller_fmus import recorded
+from night.random_calls import arm, build, can_sanitize, controller, run
 from servobench.fmus.export import ExportOptions, product
 
 CONFIGURATION = Path(__file__).parents[2] / ".clang-tidy"
@@ -20,9 +21,11 @@ PRODUCTS = {
     "controller": lambda version: recorded("ukf_mfac").product(version),
 }
 
-pytestmark = pytest.mark.skipif(shutil.which("clang-tidy") is None, reason="needs clang-tidy")
+NEEDS_TIDY = pytest.mark.skipif(shutil.which("clang-tidy") is None, reason="needs clang-tidy")
+CALLS = 100_000
 
 
+@NEEDS_TIDY
 @pytest.mark.parametrize(
     ("what", "version", "begin"), [("plant", 2, ALL), ("plant", 3, "fmi3"), ("controller", 3, ALL)]
 )
@@ -35,6 +38,7 @@ def test_the_sources_of_an_exported_fmu_are_clean(what, version, begin, tmp_path
             assert found.returncode == 0, found.stdout
 
 
+@NEEDS_TIDY
 def test_a_defect_is_found(tmp_path):
     exported = PRODUCTS["plant"](2)
     write(exported, tmp_path)
@@ -55,3 +59,23 @@ def tidy(file, *, generated=False):
     checks = [f"--checks={CASADI}"] if generated else []
     command = ["clang-tidy", "--quiet", f"--config-file={CONFIGURATION}", *checks, str(file), "--", "-std=c11"]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+NEEDS_SANITIZERS = pytest.mark.skipif(not can_sanitize(), reason="needs a C compiler with sanitizers")
+
+
+@NEEDS_SANITIZERS
+@pytest.mark.parametrize("kind", [arm, controller])
+@pytest.mark.parametrize("version", [2, 3])
+def test_random_calls_touch_no_memory_but_their_own(version, kind, tmp_path):
+    """Ten million calls in any order are made by `make nightly`: benchmarks/night/random_calls."""
+    made, refused = run(build(tmp_path, kind(version)), CALLS, seed=1)
+    assert made == CALLS
+    assert 0.2 * CALLS < refused < 0.9 * CALLS  # both good and bad calls are among them
+
+
+@NEEDS_SANITIZERS
+def test_a_missing_check_is_found(tmp_path):
+    program = build(tmp_path, arm(3), defect="k + size > n_values")
+    with pytest.raises(AssertionError, match="AddressSanitizer|runtime error"):
+        run(program, CALLS, seed=1)
