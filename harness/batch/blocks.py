@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import pickle
 import re
 import sys
@@ -33,7 +32,7 @@ import pandas as pd
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
-from servobench.harness.batch.processes import Bounds, Limits
+from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import LOST, Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config.registry import (
     Offer,
@@ -408,7 +407,7 @@ def open_workers(
     """
     if scheduler is not None and count is not None:
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
-    count = count or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+    count = count or min(MAX_DEFAULT_WORKERS, available_processors())
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:

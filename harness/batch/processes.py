@@ -1,7 +1,7 @@
 """Limits of runs, and the processes below one: their ids, their memory, their end, their ties to the one above.
 
-For Linux, where a process can adopt the orphans among its descendants, so that a child that was started in a session
-of its own, with its parent gone, also stays below the process that answers for it. The one module that imports psutil.
+The one module that imports psutil. On Linux a process can adopt the orphans among its descendants, so that a child that
+was started in a session of its own, with its parent gone, also stays below the process that answers for it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import os
 import re
 import resource
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from typing import Any, Final
 
 import psutil
 
+LINUX: Final = sys.platform == "linux"  # of the other systems, macOS is provided for
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
 FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
@@ -57,6 +59,11 @@ class Bounds:
         return Limits(seconds, size, addresses=self.run_memory is not None)
 
 
+def available_processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if LINUX else os.cpu_count() or 1
+
+
 def lead_session() -> None:
     """Leave the terminal and its Ctrl-C behind."""
     with contextlib.suppress(OSError):  # it leads one
@@ -81,7 +88,8 @@ def wake_without_parent() -> None:
 
 
 def _prctl(option: int, value: int) -> None:
-    ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+    if LINUX:
+        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
 def descendants(process: int) -> list[int]:
@@ -96,6 +104,8 @@ def descendants(process: int) -> list[int]:
 
 def _children(process: int) -> list[int]:
     """Return the ids of the children of a process."""
+    if not LINUX:
+        return _ask(process, lambda each: [child.pid for child in each.children()]) or []
     try:
         lists = [(task / "children").read_text() for task in Path(f"/proc/{process}/task").iterdir()]
     except (FileNotFoundError, ProcessLookupError):  # it has ended
@@ -110,7 +120,10 @@ def resident_memory(processes: Iterable[int]) -> int:
 
 def own_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    return sum(_ask(process, lambda each: each.memory_full_info().pss) or 0 for process in processes)
+    return sum(
+        _ask(process, lambda each: getattr(each.memory_full_info(), "pss" if LINUX else "uss")) or 0
+        for process in processes
+    )
 
 
 def is_stopped(process: int | None) -> bool:
@@ -132,7 +145,7 @@ def limit_resources(memory: int | None) -> None:
     Not all addresses are memory: drivers of graphics cards reserve hundreds of gigabytes of them.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    if memory is not None:
+    if memory is not None and LINUX:
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
         soft = psutil.Process().memory_info().vms + memory
         if hard == resource.RLIM_INFINITY or soft < hard:

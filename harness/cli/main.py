@@ -88,6 +88,8 @@ def _no_type(ctx: object) -> None:
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
     _say_where_a_signal_strikes()
+    if not hasattr(os, "fork"):
+        _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")
     try:
         with rejoining_words():
             code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
