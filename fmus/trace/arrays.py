@@ -145,18 +145,12 @@ class Traced(NDArrayOperatorsMixin):
     def __setitem__(self, key: Any, value: Any) -> None:  # noqa: ANN401 - any index, any array
         """Write to the buffer."""
         places = np.asarray(self.places[_plain_key(key)])
-        if isinstance(value, Traced) and not value.constant:
-            content = casadi.MX(self.buffer.content) if not self.constant else casadi.MX(casadi.DM(self.buffer.content))
-            content.nz[places.reshape(-1).tolist()] = spread(value, places.shape).flat()
-            self.buffer.content = content
-        elif self.constant:
-            numbers = value.numbers() if isinstance(value, Traced) else value
+        if self.constant and (not isinstance(value, Traced) or value.constant):
             self.buffer.content = self.buffer.content.copy()
-            self.buffer.content[places] = numbers
+            self.buffer.content[places] = value.numbers() if isinstance(value, Traced) else value
         else:
-            numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), places.shape)
-            content = casadi.MX(self.buffer.content)
-            content.nz[places.reshape(-1).tolist()] = casadi.MX(casadi.DM(numbers.reshape(-1)))
+            content = casadi.MX(casadi.DM(self.buffer.content) if self.constant else self.buffer.content)
+            content.nz[places.reshape(-1).tolist()] = spread(as_traced(value), places.shape).flat()
             self.buffer.content = content
 
     def arranged(self, places: Places) -> Traced:

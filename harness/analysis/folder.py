@@ -38,12 +38,12 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
     described = DESCRIBED | {name: name for name in runs.columns if name.startswith(SECTIONS)}
     facts |= {head: _listed(runs[name].unique().tolist()) for name, head in described.items() if name in runs}
-    packages = manifest.get("packages") or {}
-    made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
-    commit = manifest.get("git_commit")
+    by = (manifest.get("packages") or {}).get("servobench") or "unknown"
+    commit = f", commit {manifest['git_commit']}" if manifest.get("git_commit") else ""
+    made = f"{manifest.get('created', 'at an unknown time')} by servobench {by}{commit}"
     return facts | {
         "seeds": _seeds(runs["seed"].tolist()),
-        "made": f"{made}{f', commit {commit}' if commit else ''}, Python {manifest.get('python', 'unknown')}",
+        "made": f"{made}, Python {manifest.get('python', 'unknown')}",
     }
 
 
@@ -71,9 +71,8 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         ConfigurationError: one of them cannot be read.
     """
     for path in sorted(folder.iterdir()):
-        if path.name in (results.RUNS, results.STEPS) or path.name.startswith("."):
-            continue
-        if path.suffix not in (".parquet", ".csv"):
+        own = path.name in (results.RUNS, results.STEPS) or path.name.startswith(".")
+        if own or path.suffix not in (".parquet", ".csv"):
             continue
         try:
             table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)

@@ -43,15 +43,10 @@ Place = tuple[str, pd.DataFrame]  # words, runs
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a results folder, for its first line. Names of controllers stand between backticks.
+    """The result of a results folder, for its first line. Names of controllers stand between backticks."""
 
-    Attributes:
-        result: one sentence.
-        cautions: limits of the evidence, a sentence each.
-    """
-
-    result: str
-    cautions: tuple[str, ...]
+    result: str  # one sentence
+    cautions: tuple[str, ...]  # limits of the evidence, a sentence each
 
 
 def judge(runs: pd.DataFrame) -> Verdict:

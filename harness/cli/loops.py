@@ -99,7 +99,7 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
     for run in runs:
         warm = warm_up(run)
         if isinstance(warm.controller, ServoController):
-            loop = SmallLoop(warm, warm.model, run.plant)
+            loop = SmallLoop(warm)
             rows.append((loop.gain_limit(), loop.latency_limit()))
         else:
             rows.append((float("nan"), float("nan")))

@@ -88,12 +88,7 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
 
 
 def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
-    """Yield figures of a results folder for a page, each in the wide and the narrow form; tasks one by one.
-
-    Args:
-        folder: the results folder.
-        runs: its table of runs.
-        kinds: those that are wanted, keys of `HEADINGS`.
+    """Yield the figures of some kinds (keys of `HEADINGS`) for a page, each wide and narrow; tasks one by one.
 
     Raises:
         ConfigurationError: not a results folder.

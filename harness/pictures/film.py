@@ -87,8 +87,10 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     if ffmpeg is None:
         return paths
     stem.parent.mkdir(parents=True, exist_ok=True)
-    step, rate = _frame_rate(run.track.time)
-    board, count = _Board(run), len(run.track.table)
+    board, time = _Board(run), run.track.time
+    count, period = len(time), float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    step = max(1, round(1.0 / (MAX_RATE * period)))  # periods from frame to frame; the film lasts as long as the run
+    rate = 1.0 / (step * period)
     with ExitStack() as stack:
         writers = [stack.enter_context(encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)) for film in films]
         replay = stack.enter_context(Replay(run, fineness=FINENESS))
@@ -137,7 +139,6 @@ def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Ite
         process = subprocess.Popen(
             call, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
         )
-
         pipe = cast("IO[bytes]", process.stdin)
 
         def write(frame: ByteArray) -> None:
@@ -329,10 +330,3 @@ def _title(run: LoggedRun) -> str:
     robot = str(row.get("robot", DEFAULT_ROBOT))
     arm = "" if robot == DEFAULT_ROBOT else f", {Path(robot).name}"
     return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {row['mismatch']}, seed {row['seed']}"
-
-
-def _frame_rate(time: FloatArray) -> tuple[int, float]:
-    """Return the periods from frame to frame, and the frames a second at which the film lasts as long as the run."""
-    period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    step = max(1, round(1.0 / (MAX_RATE * period)))
-    return step, 1.0 / (step * period)

@@ -101,13 +101,10 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
 
 
 def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFrame, legend: str) -> list[Path]:
-    """Write the pictures as PNG and PDF, and a page of them; return the files, the page first.
+    """Write the pictures of at least one loop as PNG and PDF, and a page of them with their table and its legend.
 
-    Args:
-        folder: of the results.
-        loops: at least one.
-        table: of text, a row for each.
-        legend: of the table.
+    Returns:
+        The files, the page first.
     """
     styles = method_styles([loop.name for loop in loops])
     with figure_style():

@@ -58,13 +58,8 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
 
     The metrics of a single task stand in one row, on a narrow sheet in one column.
 
-    A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
-
-    Args:
-        runs: of one plant and mismatch.
-        kind: one of `FIGURES`; of its metrics those without any value are left out.
-        styles: controller -> style.
-        layout: of the figure; a narrow one is for a single task.
+    A bar is the median over runs. Runs that never settled stand at the right edge and are counted there. `kind` is one
+    of `FIGURES`; of its metrics those without any value are left out. A narrow layout is for a single task.
     """
     rows = [
         name for name, metric in METRICS.items() if metric.figure == kind and name in runs and runs[name].notna().any()
@@ -260,13 +255,9 @@ def draw_places(
     values: Mapping[str, Sequence[Estimate]],
     styles: Mapping[str, MethodStyle],
 ) -> None:
-    """Draw an estimate with its interval for each method at each place; the marks of the methods are shifted sideways.
+    """Draw an estimate with its interval for each method at each place (abscissae, ascending), marks shifted sideways.
 
-    Args:
-        axes: where.
-        places: abscissae, ascending; marks are spread over a part of the first distance.
-        values: method -> an estimate a place; an infinite one is left out, an infinite end leaves the picture.
-        styles: method -> style.
+    An infinite estimate is left out, an infinite end of an interval leaves the picture.
     """
     width = SPREAD * (places[1] - places[0] if len(places) > 1 else 1.0)
     for k, (name, estimates) in enumerate(values.items()):
@@ -291,14 +282,8 @@ def draw_curves(
 ) -> None:
     """Draw an estimate over a quantity, a line a method with its interval as a band; abscissae are to scale.
 
-    Methods with the same curve share one line, and the panel names them.
-
-    Args:
-        axes: where.
-        places: abscissae, ascending.
-        values: method -> an estimate a place; an infinite one is a mark at the upper edge.
-        styles: method -> style.
-        top: upper edge of the panel.
+    Methods with the same curve share one line, and the panel names them. An infinite estimate is a mark at the upper
+    edge `top`.
     """
     x, shared = np.array(places, dtype=float), []
     groups = same_curves(values)

@@ -22,7 +22,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.analysis import groups
+from servobench.harness.analysis import tables
 from servobench.harness.analysis.comparison import (
     handy_unit,
     in_handy_units,
@@ -81,7 +81,7 @@ ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<hig
 NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
 BREAKS: Final = re.compile(r"([_:+=/,.])")  # signs after which a long name may go on in the next line
 TICKED: Final = re.compile(r"`([^`]*)`")
-CONTROLLER: Final = (groups.WHICH, "controller")
+CONTROLLER: Final = (tables.WHICH, "controller")
 INFINITE: Final = "∞"
 LENGTHY: Final = 24  # letters of a word that may be broken anywhere
 FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
@@ -98,14 +98,7 @@ class Picture(NamedTuple):
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the report on a results folder.
-
-    Args:
-        folder: a results folder.
-        path: the page; by default `report.html` in the folder.
-
-    Returns:
-        The page's path.
+    """Write the report on a results folder, by default `report.html` in it, and return its path.
 
     Raises:
         ConfigurationError: not a results folder, no run in it, or the page cannot be written.
@@ -153,8 +146,8 @@ def _picture(kind: str, title: str, tasks: tuple[str, ...], wide: Figure, narrow
 def _page(folder: Path, runs: pd.DataFrame) -> str:
     views, shown = path_views(folder, runs), _shown(runs)
     style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
-    numbered, facts = groups.runs_table(shown), describe_folder(folder, runs)
-    numbered.insert(0, (groups.WHICH, "run"), shown.index.to_list())
+    numbered, facts = tables.runs_table(shown), describe_folder(folder, runs)
+    numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -168,7 +161,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         policy=_policy(style, scripts),
         style=Markup(style),
         scripts=[Markup(script) for script in scripts],
-        groups=groups,
+        tables=tables,
         long_table=LONG_TABLE,
         missing=results.describe_missing(folder),
         verdict=judge(runs),
@@ -231,7 +224,7 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
     scales = {name: shown_unit(name, shown)[1] for name in known}
     place = shown.groupby(
-        ["controller", *(n for n in ("task", *groups.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
+        ["controller", *(n for n in ("task", *tables.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
         dropna=False,
     ).ngroup()
     runs = {
@@ -278,10 +271,6 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
 
     Of many runs each has few points: each is the largest error of the periods for which it stands. Of more runs than
     fit into a page, the first ones have a curve.
-
-    Args:
-        folder: a results folder.
-        runs: those wanted, in the order in which they matter.
     """
     least, most = CURVE_POINTS
     wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
@@ -289,10 +278,10 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     curves: dict[str, Json] = {}
     for first in range(0, len(wanted), STEPS_AT_ONCE) if results.has_steps(folder) else ():
         part = wanted[first : first + STEPS_AT_ONCE]
-        tables = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
+        steps = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
         for run_id, feature_unit in zip(part["run_id"], texts_of(part, "feature_unit"), strict=True):
-            if run_id in tables:
-                curves[run_id] = _curve(tables[run_id], feature_unit, points)
+            if run_id in steps:
+                curves[run_id] = _curve(steps[run_id], feature_unit, points)
     return curves
 
 
@@ -303,9 +292,9 @@ def _curve(steps: pd.DataFrame, feature_unit: str | None, points: int) -> Json:
     return {"end": rounded(float(steps["time_s"].iloc[-1])), "unit": unit, "error": error}
 
 
-def rounded(value: float, digits: int = DIGITS) -> float | None:
+def rounded(value: float) -> float | None:
     """Return a number with few digits for JSON, None where it is not finite."""
-    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+    return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
 
 
 def _view(title: str, tracks: Tracks) -> Json:
@@ -361,7 +350,7 @@ class Sheet(NamedTuple):
 
 def sheet(table: pd.DataFrame) -> Sheet:
     """Return the columns of a table, which are headings or pairs (group, heading)."""
-    columns = [name if isinstance(name, tuple) else (groups.WHICH, str(name)) for name in table]
+    columns = [name if isinstance(name, tuple) else (tables.WHICH, str(name)) for name in table]
     spans = [(group, len(list(own))) for group, own in groupby(str(group) for group, _ in columns)]
     units = [str(heading).partition(" [") for _, heading in columns]
     size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"

@@ -100,11 +100,7 @@ def draw_features(
 ) -> Figure:
     """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
 
-    Args:
-        tasks: task -> controller -> run.
-        until: task -> the time at which its column ends [s].
-        styles: controller -> style.
-        layout: of the figure; a narrow one is for a single task.
+    The column of a task ends at `until[task]` [s]. A narrow layout is for a single task.
     """
     features = _features(tasks)
     figure = Figure(figsize=(layout.width, 1.1 + 1.3 * len(features)), layout="constrained")
@@ -132,21 +128,18 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
             axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
         return figure
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
-    heads = divisions(ensembles)
+    heads, closing = divisions(ensembles), each(Track.closing, tracks)
     figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
     panels = figure.subplots(
         1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
         height_ratios=[2.2, *[1.0] * len(features)],
     )  # fmt: skip
-    closing = each(Track.closing, tracks)
     for column, (head, names) in zip(panels.T, heads.items(), strict=True):
         draw_error(column[0], {name: ensembles[name] for name in names}, styles)
-        column[0].set_title(head)
-        column[0].set_ylabel(f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
+        column[0].set(title=head, ylabel=f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
         shown = {name: closing[name] for name in names if name in closing}
-        for axes, feature in zip(column[1:], features, strict=True):
-            if shown:
-                draw_feature(axes, shown, styles, feature)
+        for axes, feature in zip(column[1:], features, strict=True) if shown else ():
+            draw_feature(axes, shown, styles, feature)
         column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
         if long:
             column[0].set_xlabel("time [s]")
@@ -222,14 +215,7 @@ def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles)
 def draw_over_seeds(
     axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles, curve: Callable[[Ensemble], FloatArray]
 ) -> None:
-    """Draw the median of a curve over seeds, and between which values most seeds are.
-
-    Args:
-        axes: where.
-        ensembles: controller -> its runs.
-        styles: controller -> style.
-        curve: of an ensemble, (r, k).
-    """
+    """Draw the median over seeds of a curve of each ensemble, (r, k), and between which values most seeds are."""
     for name, ensemble in ensembles.items():
         values, style = curve(ensemble), styles[name]
         low, middle, high = (quantile(values, share) for share in BAND)
@@ -278,12 +264,9 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
 
 
 def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
-    """Draw the commanded joint motion of one run of each controller; None without commands.
+    """Draw the commanded joint motion of one run of each controller until a time [s]; None without commands.
 
-    Args:
-        tracks: controller -> run.
-        until: the time at which the figure ends [s]; a long run is shown at its end.
-        layout: of the figure; three columns need a wide one.
+    A long run is shown at its end. Three columns need a wide layout.
     """
     shown = each(Track.closing, tracks)
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)

@@ -61,19 +61,12 @@ _OTHER_MARKERS = ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in "abcdef
 
 @dataclass(frozen=True)
 class Layout:
-    """The sheet on which a figure is laid out; its type has the same size in points on each.
+    """The sheet on which a figure is laid out; its type has the same size in points on each."""
 
-    Attributes:
-        width: [in].
-        columns: panels beside each other, at most.
-        pixels: [px] of a page that the width takes.
-        density: pixels of a picture for each of the page's.
-    """
-
-    width: float
-    columns: int
-    pixels: int
-    density: float
+    width: float  # [in]
+    columns: int  # panels beside each other, at most
+    pixels: int  # [px] of a page that the width takes
+    density: float  # pixels of a picture for each of the page's
 
     @property
     def scale(self) -> float:
@@ -82,28 +75,18 @@ class Layout:
 
 
 WIDE = Layout(WIDTH, 3, 1000, 1.5)
-
-
 NARROW = Layout(2.75, 1, 335, 2.0)  # of a phone of 390 px, with a bar to scroll
 
 
 @dataclass(frozen=True)
 class MethodStyle:
-    """Colour, line and marker of a method.
+    """Colour, line and marker of a method."""
 
-    Attributes:
-        colour: as matplotlib and browsers take it.
-        line: matplotlib's line style.
-        marker: matplotlib's marker; empty = none.
-        shift: 0 … 1, where between two marks of another method this one's marks lie.
-        hollow: whether its marks are not filled.
-    """
-
-    colour: str
-    line: Any
-    marker: str
-    shift: float = 0.0
-    hollow: bool = False
+    colour: str  # as matplotlib and browsers take it
+    line: Any  # matplotlib's line style
+    marker: str  # matplotlib's marker; empty = none
+    shift: float = 0.0  # 0 … 1, where between two marks of another method this one's marks lie
+    hollow: bool = False  # whether its marks are not filled
 
     @property
     def face(self) -> str:
@@ -186,11 +169,7 @@ def fitted(name: str, letters: int) -> str:
 
 
 def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
-    """Return the context in which every figure is drawn; text in SVG stays text, fonts in PDF are embedded.
-
-    Args:
-        size: of the text [pt].
-    """
+    """Return the context in which every figure is drawn, with text of a size [pt]; fonts in PDF are embedded."""
     return mpl.rc_context(
         {
             "font.size": size,
@@ -207,11 +186,7 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
 def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1.0) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels with a common ordinate, and its `count` panels.
 
-    Args:
-        count: how many panels, at least one.
-        height: of a row [in].
-        layout: of the figure.
-        head: height of the title and the legend [in].
+    A row is `height` high [in], title and legend together `head` [in].
     """
     columns = min(layout.columns, count)
     rows = -(-count // columns)

@@ -16,13 +16,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import (
-    POINT_TO_POINT,
-    handy_unit,
-    settling_times,
-    texts_of,
-    with_places,
-)
+from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, texts_of, with_places
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -43,13 +37,9 @@ MIN_SHARE = 0.2  # of a run that a figure shows at least
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What is shown of runs of a task, as their row in the table of runs says.
+    """What is shown of runs of a task, as their row in the table of runs says."""
 
-    Attributes:
-        row: of the run, or of the first one.
-    """
-
-    row: Mapping[str, Any]
+    row: Mapping[str, Any]  # of the run, or of the first one
 
     @property
     def point_to_point(self) -> bool:
@@ -70,13 +60,9 @@ class Shown:
 @final
 @dataclass(frozen=True, eq=False)
 class Track(Shown):
-    """The steps of one run.
+    """The steps of one run."""
 
-    Attributes:
-        table: its steps, at least one; columns without any value are left out.
-    """
-
-    table: pd.DataFrame
+    table: pd.DataFrame  # of its steps, at least one; columns without any value are left out
 
     @property
     def completed(self) -> bool:
@@ -140,21 +126,13 @@ Tracks = dict[str, Track]
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The runs that belong into one figure: of one plant and mismatch, and in each task of one seed.
-
-    Attributes:
-        plant: its name.
-        mismatch: as it was given.
-        runs: all runs of this plant and mismatch.
-        seed: of the runs in `tasks`.
-        tasks: task -> controller -> track; tasks without any step are left out.
-    """
+    """The runs that belong into one figure: of one plant and mismatch, and in each task of one seed."""
 
     plant: str
-    mismatch: str
-    runs: pd.DataFrame
-    seed: int
-    tasks: dict[str, Tracks]
+    mismatch: str  # as it was given
+    runs: pd.DataFrame  # all of this plant and mismatch
+    seed: int  # of the runs in `tasks`
+    tasks: dict[str, Tracks]  # task -> controller -> track; tasks without any step are left out
 
     def select(self, *, point_to_point: bool) -> dict[str, Tracks]:
         """Return the tasks with a fixed target, or those with a moving reference."""
@@ -166,11 +144,7 @@ class Group:
 
 
 def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
-    """Yield a group for each plant and mismatch, with the runs of its smallest seed.
-
-    Args:
-        folder: the results folder.
-        runs: its table of runs.
+    """Yield a group for each plant and mismatch of a folder's table of runs, with the runs of its smallest seed.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -190,13 +164,7 @@ def track_of(row: Mapping[str, Any], steps: pd.DataFrame) -> Track:
 
 
 def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
-    """Return the steps of each run that has some, by its identifier.
-
-    Args:
-        folder: a results folder.
-        run_ids: those wanted.
-        columns: these only; None for all.
-    """
+    """Return the steps of each of these runs that has some, by its identifier; all columns, or those named."""
     try:
         steps = results.load_steps(folder, run_ids, columns)
     except ConfigurationError:  # none is kept, or each of these runs ended before its first period
@@ -287,12 +255,7 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
 
 
 def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
-    """Return the ensembles of `runs`, task -> controller -> ensemble; those without any step are left out.
-
-    Args:
-        folder: the results folder.
-        runs: rows of its table, of one plant and mismatch.
-    """
+    """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
     run = results.read_manifest(folder).get("configuration", {}).get("run", {})
     share = float(run.get("camera_moves_at", math.nan))
     tracks: dict[str, dict[str, list[Track]]] = {}

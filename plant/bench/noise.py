@@ -32,11 +32,6 @@ Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 TINY: Final = 2.0**-54
 
 
-def white(generator: np.random.Generator, shape: Shape) -> FloatArray:
-    """Return normal numbers of deviation 1."""
-    return generator.standard_normal(shape)
-
-
 def mixture(
     generator: np.random.Generator, shape: Shape, *, share: float, offset: float, spread: float = 1.0
 ) -> FloatArray:
@@ -109,7 +104,7 @@ def family_of(config: SensingConfig) -> Draw:
     if config.feature_noise > 0.0:
         offset = config.noise_offset / config.feature_noise
     families: dict[Family, Draw] = {
-        "white": white,
+        "white": np.random.Generator.standard_normal,
         "mixture": partial(mixture, share=share, offset=offset, spread=config.noise_spread),
         "bimodal": partial(bimodal, share=share, offset=offset),
         "stable": partial(stable, stability=config.stability, skewness=config.skewness),

@@ -201,7 +201,7 @@ class PlantEntry:
         name: the word on the command line.
         summary: one line for `servobench plants`.
         config: settings class with a default for every field; its noise and latency can be varied if it has a field
-            `sensing` of class `servobench.plant.bench.bench.SensingConfig`.
+            `sensing` of class `servobench.plant.contract.sensing.SensingConfig`.
         build: makes the plant from its settings and the setup.
         own_robot: it brings a robot and a start of its own: taught tasks, `--robot` and mismatches do not apply, and
             no nominal model is known.

@@ -11,7 +11,7 @@ coefficient of radial distortion, as in OpenCV. All functions take leading axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -126,8 +126,6 @@ def _depth(points: FloatArray) -> FloatArray:
     depth = points[..., 2:]
     if depth.dtype != object:
         return np.maximum(depth, NEAR)
-    least = np.empty(depth.shape, dtype=object)  # Expressions have methods in place of numpy's functions.
-    for index in np.ndindex(depth.shape):
-        z: Any = depth[index]
-        least[index] = z.fmax(NEAR)
+    # Expressions have methods in place of numpy's functions.
+    least: FloatArray = np.frompyfunc(lambda z: z.fmax(NEAR), 1, 1)(depth)
     return least

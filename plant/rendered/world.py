@@ -157,18 +157,15 @@ class RenderedWorld(World):
         for first in range(0, self._steps, CONTACT_STEPS):
             last = min(first + CONTACT_STEPS, self._steps)
             self._joints = self._simulation.advance(self._joints, speed, last - first)
-            self._check_state(last)
+            if not np.isfinite(self._joints.angle).all():
+                raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
+            self._check_contact(last)
         self._scene.place(self._joints.angle)
         self._periods += 1
         if self._config.view:
-            self._keep_pace()
+            # The window shows the run at the pace of the wall clock.
+            time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
         return self._reported()
-
-    def _check_state(self, step: int) -> None:
-        """Raise a fault, at a physics step, if joints are not finite or the arm touches a body."""
-        if not np.isfinite(self._joints.angle).all():
-            raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
-        self._check_contact(step)
 
     def _check_contact(self, step: int) -> None:
         room, own = self._config.room_contact, self._config.self_contact
@@ -232,7 +229,3 @@ class RenderedWorld(World):
         lower, upper, half = self.spec.joint_lower, self.spec.joint_upper, resolution / 2.0
         steps = np.where(q >= upper - half, upper, np.round(q / resolution) * resolution)
         return np.where(q <= lower + half, lower, steps)
-
-    def _keep_pace(self) -> None:
-        """Wait until the wall clock has reached the time of the run; only with a window."""
-        time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))

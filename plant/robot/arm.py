@@ -16,15 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from servobench.plant.contract.checks import FloatArray, as_array, as_vector
-
-CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # indices of the factors in a cross product
 
@@ -208,46 +204,6 @@ def arm_from_modified_dh(
     rpy = np.zeros((n + 1, 3))
     rpy[:, 0] = alpha_
     return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.zeros(3))
-
-
-def arm_from_calibration(path: Path, tool: npt.ArrayLike, joint_names: tuple[str, ...]) -> SerialArm:
-    """Return the arm that a Universal Robots factory-calibration file describes.
-
-    Args:
-        path: YAML file as the `ur_calibration` tool writes it: six blocks of x, y, z [m], roll, pitch, yaw [rad].
-        tool: (3,), m, ball centre in the flange frame.
-        joint_names: six names.
-
-    Returns:
-        The arm with gear ratios of 1 and no joint offsets.
-
-    Raises:
-        ValueError: the file is missing, is not such a file, or a number in it is not finite.
-    """
-    try:
-        blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]
-        keys = ("x", "y", "z", "roll", "pitch", "yaw")
-        table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
-    except OSError as error:
-        raise ValueError(f"calibration file {path} cannot be read: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
-    except KeyError as error:
-        raise ValueError(
-            f"calibration file {path} lacks {error}; wanted 'kinematics' with the blocks "
-            f"{', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
-        ) from error
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"calibration file {path} holds something that is not a number where one is wanted: 'kinematics' has the "
-            f"blocks {', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
-        ) from error
-    if not np.isfinite(table).all():
-        raise ValueError(f"calibration file {path} holds a number that is not finite")
-    n = len(CALIBRATION_BLOCKS)
-    flange = np.zeros((1, 3))
-    translation, rpy = np.vstack([table[:, :3], flange]), np.vstack([table[:, 3:], flange])
-    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), as_vector("tool", tool, 3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
 from servobench.plant.robot.arm import JointLimits, SerialArm, narrow_limits
 
-FEATURE_NAMES = ("x", "y", "z")
-FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
+FEATURE = Channel(("x", "y", "z"), "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
 WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are sought
 
@@ -214,5 +213,5 @@ def hand_eye_spec(
         ValueError: a period, speed or range that is not positive.
     """
     both = narrow_limits(limits, model.arm.n, max_joint_speed, joint_range)
-    spec = PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)
-    return replace(spec, feature=model.channel)
+    command = Channel(model.arm.joint_names, "rad/s", 1.0, -both.speed, both.speed)
+    return PlantSpec(model.channel, command, both.lower, both.upper, period)

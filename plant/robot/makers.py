@@ -17,15 +17,18 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
+import yaml
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.files import user_path
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_calibration, arm_from_dh, arm_from_modified_dh
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
 from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
+CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 NO_BALL: Final = (0.0, 0.0, 0.0)
 UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
 PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
@@ -220,13 +223,45 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
     return arm
 
 
-def read_calibration(path: Path | None, tool: FloatArray) -> SerialArm:
-    """Return the arm of a calibration file with a ball at `tool` (3,) m; None stands for the file of the package.
+def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
+    """Return the arm that a Universal Robots factory-calibration file describes.
+
+    Args:
+        path: YAML file as the `ur_calibration` tool writes it: six blocks of x, y, z [m], roll, pitch, yaw [rad]; None
+            for the file of the package.
+        tool: (3,), m, ball centre in the flange frame.
+
+    Returns:
+        The arm with gear ratios of 1 and no joint offsets.
 
     Raises:
-        ValueError: the file is missing or malformed.
+        ValueError: the file is missing, is not such a file, or a number in it is not finite.
     """
-    return arm_from_calibration(ur5.shipped_calibration() if path is None else path, tool, ur5.JOINT_NAMES)
+    path = ur5.shipped_calibration() if path is None else path
+    try:
+        blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]
+        keys = ("x", "y", "z", "roll", "pitch", "yaw")
+        table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
+    except OSError as error:
+        raise ValueError(f"calibration file {path} cannot be read: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
+    except KeyError as error:
+        raise ValueError(
+            f"calibration file {path} lacks {error}; wanted 'kinematics' with the blocks "
+            f"{', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
+        ) from error
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"calibration file {path} holds something that is not a number where one is wanted: 'kinematics' has the "
+            f"blocks {', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
+        ) from error
+    if not np.isfinite(table).all():
+        raise ValueError(f"calibration file {path} holds a number that is not finite")
+    n = len(CALIBRATION_BLOCKS)
+    flange = np.zeros((1, 3))
+    translation, rpy = np.vstack([table[:, :3], flange]), np.vstack([table[:, 3:], flange])
+    return SerialArm(ur5.JOINT_NAMES, translation, rpy, np.zeros(n), np.ones(n), as_vector("tool", tool, 3))
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:

@@ -22,6 +22,6 @@ NO_POSTURE = {"aids": {"posture": False}}
 def test_predicted_limits_are_those_of_small_motions(controller, settings):
     run = resolve(RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings}))
     predicted, warm = analyse_loop(run), warm_up(run)
-    loop = SmallLoop(warm, warm.model, run.plant)
+    loop = SmallLoop(warm)
     assert abs(loop.latency_limit() - predicted.latency_limit) <= run.run.period
     assert loop.gain_limit() == pytest.approx(predicted.margins.gain, rel=0.1)

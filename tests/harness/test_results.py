@@ -9,9 +9,19 @@ import pytest
 
 from kit.command import servobench
 from kit.folders import comparison, made_up_row, made_up_steps, write_folder
-from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
-from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
+from servobench.harness.analysis.tables import (
+    cost_table,
+    curve_tables,
+    failure_table,
+    move_tables,
+    outcome_table,
+    overview,
+    runs_table,
+    statistics_rows,
+    summary_legend,
+    summary_tables,
+)
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results, tables
 from servobench.harness.batch.integrity import examine
@@ -230,8 +240,8 @@ def read_runs(folder):
     list(statistics_rows(runs))
     list(summary_tables(runs))
     summary_legend(runs)
-    makers = (groups.overview, groups.move_tables, groups.curve_tables, groups.cost_table, groups.outcome_table)
-    for make in (*makers, groups.failure_table, groups.runs_table, judge, leaders):
+    makers = (overview, move_tables, curve_tables, cost_table, outcome_table, failure_table, runs_table)
+    for make in (*makers, judge, leaders):
         make(runs)
     draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
 

@@ -11,15 +11,14 @@ from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.arm import (
-    CALIBRATION_BLOCKS,
     SerialArm,
-    arm_from_calibration,
     arm_from_dh,
     arm_from_modified_dh,
     rotation_from_rpy,
     rpy_from_rotation,
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
 from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, ur5_arm
 
 
@@ -195,7 +194,7 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(ValueError, match=f"calibration.yaml .*{message}|{message} .*calibration.yaml") as caught:
-        arm_from_calibration(path, TOOL, JOINT_NAMES)
+        read_calibration(path, TOOL)
     assert "\n" not in str(caught.value)
 
 

@@ -28,7 +28,7 @@ def mixed(x, parts):
 
 
 FAMILIES = {
-    "white": (families.white, stats.norm.cdf),
+    "white": (np.random.Generator.standard_normal, stats.norm.cdf),
     "contaminated": (
         partial(families.mixture, share=0.2, offset=0.0, spread=10.0),
         lambda x: mixed(x, [(0.8, 0.0, 1.0), (0.2, 0.0, 10.0)]),

@@ -244,6 +244,7 @@ class Warm:
         nominal: the robot by its maker's description.
         rest: the place where it is now, as if the feature were wanted there.
         arm: linear model of arm and camera there.
+        plant: settings of the plant.
     """
 
     controller: Controller
@@ -251,14 +252,11 @@ class Warm:
     nominal: HandEyeModel
     rest: Rest
     arm: ArmModel
+    plant: KinematicConfig
 
 
-def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
-    """Carry out the begin of a run on the kinematic plant.
-
-    Args:
-        resolved: the run; its task is a move to a target at rest.
-        duration: of the warm-up [s].
+def warm_up(resolved: ResolvedRun) -> Warm:
+    """Carry out the begin of a run on the kinematic plant, whose task is a move to a target at rest.
 
     Raises:
         ConfigurationError: a name or a setting that cannot be used.
@@ -266,7 +264,7 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
     """
     experiment, seed = build(resolved), resolved.request.seed
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    length = LoopSettings(run.periods(duration), run.preview_rows)
+    length = LoopSettings(run.periods(WARM_UP), run.preview_rows)
     rollout = begin(plant, controller, experiment.desired(length.periods), length, (seed, seed))
     for _ in periods(rollout, controller):
         pass
@@ -275,7 +273,7 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
-    return Warm(controller, model, find_robot(resolved.request.robot).nominal, rest, arm)
+    return Warm(controller, model, find_robot(resolved.request.robot).nominal, rest, arm, resolved.plant)
 
 
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
@@ -318,26 +316,17 @@ def linear_controller(warm: Warm, source: Source) -> StateSpace:
 class SmallLoop:
     """A composed controller, frozen at its rest, on the kinematic plant without noise."""
 
-    def __init__(self, warm: Warm, model: HandEyeModel, config: KinematicConfig) -> None:
-        """Freeze the controller, whose estimator returns the true Jacobian at every posture.
+    def __init__(self, warm: Warm) -> None:
+        """Freeze a composed controller, whose estimator returns the true Jacobian at every posture.
 
-        Args:
-            warm: the composed controller after its warm-up.
-            model: the true robot.
-            config: of the plant; its noise and lost frames are left out.
+        Noise and lost frames of the plant are left out.
         """
         servo, state, self._rest = at_rest(warm, "true")
-        self._servo, self._state = frozen(servo, state, model.jacobian)
-        self._model, self._config, self._period = model, config, warm.arm.period
-        self.latency = config.sensing.latency
+        self._servo, self._state = frozen(servo, state, warm.model.jacobian)
+        self._warm, self._period, self.latency = warm, warm.arm.period, warm.plant.sensing.latency
 
     def is_stable(self, factor: float = 1.0, latency: float | None = None) -> bool:
-        """Return whether small motions die out.
-
-        Args:
-            factor: on the command.
-            latency: of the camera [s]; None for that of the plant's settings.
-        """
+        """Return whether small motions die out with a factor on the command and another latency of the camera [s]."""
         moved, rested = (self._features(factor, latency, offset) for offset in (OFFSET, 0.0))
         errors = np.linalg.norm(moved - rested - OFFSET, axis=-1)
         length = len(errors) // WINDOWS
@@ -365,9 +354,9 @@ class SmallLoop:
     def _features(self, factor: float, latency: float | None, offset: float) -> FloatArray:
         """Return the true feature in each period, (periods, m), with the desired one moved by an offset [m]."""
         rest, late = self._rest, self.latency if latency is None else latency
-        sensing = replace(without_disturbance(self._config.sensing), latency=round(late, TIME_DIGITS))
-        setup = PlantSetup(self._model, rest.joint_position, self._period)
-        plant = build_kinematic(replace(self._config, sensing=sensing), setup)
+        sensing = replace(without_disturbance(self._warm.plant.sensing), latency=round(late, TIME_DIGITS))
+        setup = PlantSetup(self._warm.model, rest.joint_position, self._period)
+        plant = build_kinematic(replace(self._warm.plant, sensing=sensing), setup)
         count = round(DURATION / self._period)
         desired = np.broadcast_to(rest.feature + offset, (count + 1 + rest.preview, len(rest.feature)))
         controller = _FrozenController(self._servo, self._state, rest, factor)

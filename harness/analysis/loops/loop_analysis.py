@@ -180,31 +180,31 @@ class SmallMotions:
         return record
 
 
-def multisine(length: int, amplitude: float) -> FloatArray:
+def multisine(length: int) -> FloatArray:
     """Return one period of equal sines at all harmonics with Schroeder's phases, (length,), without a mean."""
     harmonics = np.arange(1, length // 2 + 1)
     spectrum = np.zeros(length // 2 + 1, dtype=np.complex128)
     spectrum[1:] = np.exp(-1j * np.pi * harmonics * (harmonics - 1) / len(harmonics))
     spectrum[-1] = 1.0  # real at the Nyquist frequency
     signal = np.fft.irfft(spectrum, length)
-    return np.asarray(amplitude * signal / np.sqrt(np.mean(signal**2)))
+    return np.asarray(AMPLITUDE * signal / np.sqrt(np.mean(signal**2)))
 
 
-def excite(loop: SmallMotions, inputs: int, length: int = LENGTH, amplitude: float = AMPLITUDE) -> list[Record]:
+def excite(loop: SmallMotions, inputs: int, length: int = LENGTH) -> list[Record]:
     """Return an experiment for each of the signals that the controller measures: its second period, less the rest."""
-    signal = np.tile(multisine(length, amplitude), 2)
+    signal = np.tile(multisine(length), 2)
     rest = loop.tried(np.zeros((len(signal), inputs)))
     excited = [loop.tried(np.outer(signal, each)) for each in np.eye(inputs)]
     return [Record(each.measured[length:] - rest.measured[length:], each.command[length:] - rest.command[length:])
             for each in excited]  # fmt: skip
 
 
-def step_responses(loop: SmallMotions, m: int, n: int, periods: int, amplitude: float = AMPLITUDE) -> FloatArray:
+def step_responses(loop: SmallMotions, m: int, n: int, periods: int) -> FloatArray:
     """Return each feature after a unit step of its own reference, (periods, m), measured in small motions."""
     nothing = np.zeros((periods, m + n))
     rest = loop.tried(nothing).measured
-    moved = [loop.tried(nothing, amplitude * each).measured for each in np.eye(m)]
-    return np.stack([(each - rest)[:, i] / amplitude for i, each in enumerate(moved)], axis=-1)
+    moved = [loop.tried(nothing, AMPLITUDE * each).measured for each in np.eye(m)]
+    return np.stack([(each - rest)[:, i] / AMPLITUDE for i, each in enumerate(moved)], axis=-1)
 
 
 def controller_response(records: list[Record], period: float) -> tuple[FloatArray, ComplexArray]:

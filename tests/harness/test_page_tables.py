@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.folders import comparison, failed_only, made_up_row, sweep
-from servobench.harness.analysis import groups
+from servobench.harness.analysis import tables
 from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES
@@ -20,7 +20,7 @@ def moves(*times: float, **values: object) -> pd.DataFrame:
 
 
 def test_a_move_that_never_settled_counts_as_the_last_to_settle():
-    (table,) = groups.move_tables(moves(1.0, 2.0, np.nan)).values()
+    (table,) = tables.move_tables(moves(1.0, 2.0, np.nan)).values()
     row = table.iloc[0]
     assert row["Runs", "number"] == "3"
     assert row["Runs", "settled [%]"] == "67 [21, 94]"  # Wilson
@@ -30,49 +30,49 @@ def test_a_move_that_never_settled_counts_as_the_last_to_settle():
 
 
 def test_a_single_run_has_a_value_without_an_interval():
-    (table,) = groups.move_tables(moves(1.0)).values()
+    (table,) = tables.move_tables(moves(1.0)).values()
     assert table["Time", "settling time [s]"].tolist() == ["1.00"]
 
 
 def test_moves_stand_apart_by_task_and_curves_beside_them(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
-    assert list(groups.move_tables(runs)) == ["exp1", "exp2"]
-    (table,) = groups.curve_tables(runs).values()
+    assert list(tables.move_tables(runs)) == ["exp1", "exp2"]
+    (table,) = tables.curve_tables(runs).values()
     assert table["RMS error", "RMS of the judged part [mm]"].tolist() == ["2.00"] * 3
     assert table["Runs", "followed [%]"].tolist() == ["100 [21, 100]"] * 3
 
 
 def test_no_table_holds_the_largest_error_of_a_move_which_is_its_start(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
-    tables = [*groups.move_tables(runs).values(), *groups.curve_tables(runs).values(), groups.overview(runs)]
-    assert not [name for table in tables for name in table.columns if "largest error" in name[1]]
+    every = [*tables.move_tables(runs).values(), *tables.curve_tables(runs).values(), tables.overview(runs)]
+    assert not [name for table in every for name in table.columns if "largest error" in name[1]]
 
 
 def test_a_published_method_stands_below_its_method_and_others_keep_their_order():
     names = pd.Series(["broyden", "ukf_mfac:published", "mine", "ukf_mfac", "rls:published"])
     wanted = ["broyden", "ukf_mfac", "ukf_mfac:published", "mine", "rls:published"]
-    assert groups.ordered(names) == wanted
+    assert tables.ordered(names) == wanted
     runs = pd.concat([moves(1.0, controller=name) for name in names])
-    assert groups.overview(runs)["", "controller"].tolist() == wanted
-    assert next(iter(groups.move_tables(runs).values()))["", "controller"].tolist() == wanted
+    assert tables.overview(runs)["", "controller"].tolist() == wanted
+    assert next(iter(tables.move_tables(runs).values()))["", "controller"].tolist() == wanted
 
 
 def test_only_conditions_that_vary_get_a_column(tmp_path):
-    (table,) = groups.move_tables(results.load_runs(sweep(tmp_path / "out"))).values()
+    (table,) = tables.move_tables(results.load_runs(sweep(tmp_path / "out"))).values()
     assert [heading for group, heading in table.columns if group == ""] == ["controller", "mismatch", "latency [ms]"]
     assert len(table) == 3 * 3 * 2
     assert set(table["", "latency [ms]"]) == {"0", "50"}
 
 
 def test_the_overview_has_a_group_for_each_task(tmp_path):
-    table = groups.overview(results.load_runs(comparison(tmp_path / "out")))
+    table = tables.overview(results.load_runs(comparison(tmp_path / "out")))
     assert list(dict.fromkeys(group for group, _ in table.columns)) == ["", "exp1", "exp2", "circle"]
     assert table["exp1", "after [s]"].tolist() == ["1.50"] * 3
     assert table["circle", "RMS error [mm]"].tolist() == ["2.00"] * 3
 
 
 def test_the_overview_of_many_conditions_is_one_group_a_task(tmp_path):
-    table = groups.overview(results.load_runs(sweep(tmp_path / "out")))
+    table = tables.overview(results.load_runs(sweep(tmp_path / "out")))
     assert [group for group, _ in table.columns] == ["", "random", "random"]
     assert table["random", "settled [%]"].iloc[0].startswith("72 [")
 
@@ -80,39 +80,39 @@ def test_the_overview_of_many_conditions_is_one_group_a_task(tmp_path):
 def test_what_came_of_runs_is_told_where_not_all_went_well():
     words = ["settled", "settled", "target_unreachable", "crashed"]
     mixed = pd.DataFrame([made_up_row(str(i), seed=i, outcome=word) for i, word in enumerate(words)])
-    row = groups.outcome_table(pd.concat([mixed, moves(1.0, 1.0, task="exp2", outcome="settled")]))
+    row = tables.outcome_table(pd.concat([mixed, moves(1.0, 1.0, task="exp2", outcome="settled")]))
     assert row["", "task"].tolist() == ["exp1"]
     assert row["As asked", "settled [%]"].tolist() == ["50 [15, 85]"]  # Wilson
     assert row["Reached the last period", "target_unreachable [%]"].tolist() == ["25 [5, 70]"]
     assert row["Ended early", "crashed [%]"].tolist() == ["25 [5, 70]"]
-    assert groups.outcome_table(moves(1.0, outcome="settled")).empty
+    assert tables.outcome_table(moves(1.0, outcome="settled")).empty
 
 
 def test_failures_are_counted_with_a_reason(tmp_path):
-    table = groups.failure_table(results.load_runs(sweep(tmp_path / "out")))
+    table = tables.failure_table(results.load_runs(sweep(tmp_path / "out")))
     assert table["", "runs"].tolist() == ["5 of 18"] * 3
     assert table["The first of them", "reason"].tolist() == ["no valid feature for 20 periods"] * 3
-    assert groups.failure_table(pd.DataFrame([made_up_row("a")])).empty
+    assert tables.failure_table(pd.DataFrame([made_up_row("a")])).empty
 
 
 def test_errors_are_in_the_unit_of_the_feature():
     radians = moves(1.0, feature_unit="rad")
-    (table,) = groups.move_tables(radians).values()
+    (table,) = tables.move_tables(radians).values()
     assert table["Error", "last second [rad]"].tolist() == ["0.00"]
-    (both,) = groups.move_tables(pd.concat([moves(1.0), radians.assign(plant="crane")])).values()
-    (metres,) = groups.move_tables(moves(1.0)).values()
+    (both,) = tables.move_tables(pd.concat([moves(1.0), radians.assign(plant="crane")])).values()
+    (metres,) = tables.move_tables(moves(1.0)).values()
     own = [*metres["Error", "last second [mm]"], *table["Error", "last second [rad]"]]
     assert both["Error", "last second [mm or rad]"].tolist() == own
 
 
 def test_times_that_are_not_known_get_no_column():
     heading = ("Step of the controller", "controller step, median [µs]")
-    assert heading in groups.cost_table(moves(1.0))
-    assert heading not in groups.cost_table(moves(1.0, controller_time_median_us=np.nan))
+    assert heading in tables.cost_table(moves(1.0))
+    assert heading not in tables.cost_table(moves(1.0, controller_time_median_us=np.nan))
 
 
 def test_a_run_tells_how_it_ended_and_what_came_of_it():
-    table = groups.runs_table(pd.DataFrame([made_up_row("a", outcome="joint_at_limit", settling_time_s=np.nan)]))
+    table = tables.runs_table(pd.DataFrame([made_up_row("a", outcome="joint_at_limit", settling_time_s=np.nan)]))
     assert table["How it ended"].iloc[0].tolist() == ["completed", "joint_at_limit"]
     assert table.iloc[0].tolist()[:3] == ["ukf_mfac", "exp1", "0"]
 
@@ -121,10 +121,10 @@ def test_a_run_tells_how_it_ended_and_what_came_of_it():
 def test_every_table_of_every_kind_of_folder_is_text_without_pythons_words(tmp_path, folder):
     path = folder(tmp_path / "out")
     runs = results.load_runs(path)
-    whole = (groups.overview, groups.outcome_table, groups.cost_table, groups.runs_table, groups.failure_table)
-    by_task = (groups.move_tables, groups.curve_tables)
-    tables = [table(runs) for table in whole] + [own for tables in by_task for own in tables(runs).values()]
-    cells = [cell for table in tables for cell in table.to_numpy().ravel()]
+    whole = (tables.overview, tables.outcome_table, tables.cost_table, tables.runs_table, tables.failure_table)
+    by_task = (tables.move_tables, tables.curve_tables)
+    made = [make(runs) for make in whole] + [own for make in by_task for own in make(runs).values()]
+    cells = [cell for table in made for cell in table.to_numpy().ravel()]
     assert cells
     assert all(isinstance(cell, str) for cell in cells)
     assert not {"nan", "inf", "None", "NaN"} & {word.strip("[],") for cell in cells for word in cell.split()}
@@ -144,5 +144,5 @@ def test_settings_are_told_in_words(tmp_path):
 
 def test_every_place_that_a_metric_names_exists():
     for metric in METRICS.values():
-        assert all(group in groups.GROUPS[table] for table, group in metric.tables.items()), metric.column
+        assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), metric.column
         assert metric.figure in ("", *FIGURES), metric.column
