@@ -43,7 +43,7 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.tables import UnwritableFolder
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache
-from servobench.harness.run.knowledge import NETWORKS, network_source
+from servobench.harness.run.knowledge import NETWORKS, NetworkSource
 from servobench.plant.contract import cache
 from servobench.plant.fmu.archive import extract_fmu
 
@@ -161,7 +161,7 @@ class Caches:
         if not archive_path.exists():
             archive_path.write_bytes(packed(2, zipfile.ZIP_DEFLATED))
         extract_fmu(archive_path)
-        network_source(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(TRAINING)
+        NetworkSource(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(TRAINING)
 
     def outcome(self, point: Path) -> dict[str, bytes]:
         entries = [entry for kind in ("extracted", NETWORKS) for entry in cache.cache_folder(kind).iterdir()]

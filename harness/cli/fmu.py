@@ -17,7 +17,6 @@ from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
-    from servobench.fmus.product import Product
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
 
@@ -56,17 +55,6 @@ class Export:
         settings.check_sections([*names, "run"])
         return RunRequest(*names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing)
 
-    def arm(self, fmi: int) -> Product:
-        """Return the arm, with the mismatch as start values."""
-        from servobench.fmus.export import ExportOptions, default_actuation, product
-        from servobench.harness.config.robots import find_robot
-        from servobench.harness.config.settings import Settings
-        from servobench.harness.run.experiment import draw_robot
-
-        described, (model, *_) = find_robot(self.robot), draw_robot(self.request("constant", Settings()))
-        words = "none" if self.mismatch == "none" else f"{self.mismatch}, seed {self.seed}"
-        return product(ExportOptions(fmi, model, default_actuation(described), mismatch=words, robot=described))
-
 
 @fmu_app.command()
 @command
@@ -88,17 +76,19 @@ def export(
 ) -> None:
     """Export an arm with a mismatch as start values, or a controller."""
     from servobench.fmus.product import check_version
-    from servobench.harness.run.export import controller_model
+    from servobench.harness.run.export import arm_product, controller_model
 
     settings = overrides.settings()
     if controller is None and settings.sections:
         raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     with exported.compiling() as platforms:
+        request = exported.request(controller or "constant", settings)
         if controller is None:
-            product = exported.arm(fmi)
+            words = "none" if exported.mismatch == "none" else f"{exported.mismatch}, seed {exported.seed}"
+            product = arm_product(request, words, fmi)
         else:
             check_version(fmi)
-            product = controller_model(exported.request(controller, settings), settings).product(fmi)
+            product = controller_model(request, settings).product(fmi)
         product.write(output, platforms)
     names = ", ".join(platform.name for platform in platforms)
     say(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}")

@@ -17,6 +17,7 @@ from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw
+from servobench.harness.run.knowledge import keep_networks
 from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
@@ -56,7 +57,7 @@ def carry_out(
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    experiment = build(resolved, keep=keep)
+    experiment = build(resolved)
     plant, log, ending = experiment.plant, StepLog(experiment.plant.spec, experiment.periods), Ending()
     try:
         with careful():
@@ -70,6 +71,8 @@ def carry_out(
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
         plant.close()
+    if keep is not None:
+        keep_networks(experiment.networks, keep)
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
     row = _row(experiment.drawn, resolved.request, ending, _judge(logged, experiment), logged, pose)
     if not steps:
@@ -96,7 +99,7 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
 
 def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunResult]:
     """Carry out runs whose logs fit into memory side by side."""
-    many, ends = build_together(runs, keep), Ends(len(runs))
+    many, ends = build_together(runs), Ends(len(runs))
     bench, log = cast(Bench, many.plant), ManyLogs(many.plant.spec, many.periods, ends)
     try:
         with careful(), contextlib.suppress(AllEnded):
@@ -106,6 +109,8 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
             )
     finally:
         bench.close()
+    if keep is not None:
+        keep_networks(many.networks, keep)
     return _judge_together(runs, many, ends, log.steps())
 
 

@@ -11,13 +11,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from servobench.controllers.controller import Controller, Delays, RobotKnowledge
-from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
@@ -126,6 +124,7 @@ class Experiment:
         controller: likewise.
         runs: the true robot and the task of each run.
         run: the settings that all of them share.
+        networks: that the controller started from, if any.
         together: whether there are lanes, also for a single run.
     """
 
@@ -133,6 +132,7 @@ class Experiment:
     controller: Controller
     runs: tuple[Drawn, ...]
     run: RunSettings
+    networks: Sequence[TrainedNetworks] = ()
     together: bool = False
 
     @property
@@ -176,12 +176,11 @@ def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
     return build(resolve(request, settings))
 
 
-def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress | None = None) -> Experiment:
+def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experiment:
     """Make a run ready.
 
     Args:
         resolved: the run.
-        keep: results folder in which trained networks are kept beside the runs.
         progress: called with the share of a training of networks that is done.
 
     Raises:
@@ -190,8 +189,8 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
     request = resolved.request
     if not find_plant(request.plant).own_robot:
         drawn = draw(resolved)
-        pair = _assemble(resolved, drawn.true, drawn.scenario.start, keep, progress)
-        return Experiment(*pair, (drawn,), resolved.run)
+        plant, controller, networks = _assemble(resolved, drawn.true, drawn.scenario.start, progress)
+        return Experiment(plant, controller, (drawn,), resolved.run, networks)
     if request.mismatch != Mismatch():
         raise ConfigurationError(
             f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
@@ -200,16 +199,16 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
         raise ConfigurationError(
             f"plant {request.plant} brings a sensor of its own, so --sensing {request.sensing} does not apply"
         )
-    plant, controller = _assemble(resolved, None, None, keep, progress)
+    plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
         setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
-        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run)
+        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks)
     except BaseException:
         plant.close()
         raise
 
 
-def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Experiment:
+def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
     """Make runs of one `lanes.side_by_side_key` ready, with a lane for each.
 
     Raises:
@@ -217,19 +216,20 @@ def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Exp
     """
     first, drawn = runs[0], tuple(map(draw, runs))
     robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
-    return Experiment(*_assemble(first, robots, starts, keep, None), drawn, first.run, together=True)
+    plant, controller, networks = _assemble(first, robots, starts)
+    return Experiment(plant, controller, drawn, first.run, networks, together=True)
 
 
 def _assemble(
     resolved: ResolvedRun,
     true: RobotModel | None,
     start: FloatArray | None,
-    keep: Path | None,
-    progress: Progress | None,
-) -> tuple[Plant, Controller]:
-    """Return plant and controller for a true robot and a start (..., n) [rad]; for None the plant brings its own.
+    progress: Progress | None = None,
+) -> tuple[Plant, Controller, Sequence[TrainedNetworks]]:
+    """Return plant, controller and its networks for a true robot and a start (..., n) [rad].
 
-    Of runs side by side the arrays of the robot have a leading axis, and `resolved` is one of them.
+    For None the plant brings its own. Of runs side by side the arrays of the robot have a leading axis, and `resolved`
+    is one of them.
 
     Raises:
         ConfigurationError: a setting that cannot be used.
@@ -247,13 +247,14 @@ def _assemble(
             nominal = find_sensing(request.sensing).nominal(robot)
             knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
             trains = in_view(knowledge, nominal, robot) if robot.known else None
-        if trains is not None:
-            knowledge = replace(knowledge, train=trained_on(trains, keep, progress))
+        source = None if trains is None else trained_on(trains, progress)
         true_model = plant.true_model if robot is None else lambda: plant.with_delays(_equations(true))
-        return plant, _build_controller(request.controller, resolved.controller, knowledge, true_model)
+        knowledge = replace(knowledge, train=source)
+        controller = _build_controller(request.controller, resolved.controller, knowledge, true_model)
     except BaseException:
         plant.close()
         raise
+    return plant, controller, () if source is None else source.given
 
 
 def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
@@ -296,7 +297,6 @@ def train_networks(
     Raises:
         ConfigurationError: a name or setting that cannot be used, or a controller without networks.
     """
-    trained: list[TrainedNetworks] = []
     run = settings.resolve("run", RunSettings())
     plant = KinematicConfig()
     robot = find_robot(robot_name)
@@ -308,17 +308,12 @@ def train_networks(
     knowledge = nominal_knowledge(robot, nominal, spec, run)
     if knowledge.nominal_jacobian is None:
         raise ConfigurationError(f"networks are trained on a nominal model, and controllers know none of {robot.title}")
-    source = trained_on(in_view(knowledge, nominal, robot), None, progress)
-
-    def obtain(config: TrainingConfig) -> TrainedNetworks:
-        trained.append(source(config))
-        return trained[-1]
-
+    source = trained_on(in_view(knowledge, nominal, robot), progress)
     config = settings.resolve(controller, default_config(find_controller(controller)))
-    _build_controller(controller, config, replace(knowledge, train=obtain), lambda: _equations(nominal))
-    if not trained:
+    _build_controller(controller, config, replace(knowledge, train=source), lambda: _equations(nominal))
+    if not source.given:
         raise ConfigurationError(f"controller {controller} has no networks to train")
-    return trained[-1]
+    return source.given[-1]
 
 
 def _equations(model: RobotModel | None) -> TrueModel:

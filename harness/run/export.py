@@ -32,9 +32,9 @@ from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.experiment import Experiment, build, draw
-from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
+from servobench.harness.run.loop import LoopSettings, begin, periods
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
@@ -132,12 +132,17 @@ def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[S
 
 
 def _run(experiment: Experiment) -> ReferenceRun:
-    """Carry out the run that the FMU repeats for comparison; it may end early."""
+    """Carry out the run that the FMU repeats for comparison, with seed 0; it may end early.
+
+    No camera is moved, and lost features do not end it.
+    """
     controller, spec = experiment.controller, experiment.plant.spec
+    length = LoopSettings(experiment.periods, experiment.run.preview_rows)
+    rollout = begin(experiment.plant, controller, experiment.desired(), length, (0, 0))
     unknown = np.zeros(spec.m * spec.n)
     inputs, outputs = [], []
     try:
-        for period in islice(periods(_begin(experiment), controller), REFERENCE_PERIODS):
+        for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
             observation, estimate = period.observation, controller.estimated_jacobian()
             rows = (
                 observation.joint_position,
@@ -159,10 +164,15 @@ def _run(experiment: Experiment) -> ReferenceRun:
     )
 
 
-def _begin(experiment: Experiment) -> Rollout:
-    """Return the run at its first instant, with seed 0 and without the camera's move and the end by lost features."""
-    length = LoopSettings(experiment.periods, experiment.run.preview_rows)
-    return begin(experiment.plant, experiment.controller, experiment.desired(), length, (0, 0))
+def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray | None = None) -> Product:
+    """Return the true arm of a run ready for export, with `words` on its mismatch; it begins at `home`, (n,) [rad].
+
+    Raises:
+        ConfigurationError: a robot, sensing or mismatch that cannot be used.
+    """
+    robot, (true, *_) = find_robot(request.robot), draw_robot(request)
+    actuation = default_actuation(robot) if home is None else replace(default_actuation(robot), home=home)
+    return product(ExportOptions(fmi, true, actuation, mismatch=words, robot=robot))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
@@ -174,15 +184,8 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
         ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
     """
     resolved = resolve(request, settings)
-    drawn, robot = draw(resolved), find_robot(request.robot)
-    if drawn.true is None:
-        raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which is not exported")
-    run: RunSettings = resolved.run
-    reference = drawn.scenario.reference.sampled(run.period, 1 + run.preview_rows)
-    actuation = default_actuation(robot)
-    if drawn.scenario.start is not None:
-        actuation = replace(actuation, home=drawn.scenario.start)
-    words = f"{request.mismatch}, seed {request.seed}"
-    plant = product(ExportOptions(2, drawn.true, actuation, mismatch=words, robot=robot))
+    scenario, run = draw(resolved).scenario, resolved.run
+    reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
+    plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", home=scenario.start)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
-    return plant, controller, drawn.scenario.duration
+    return plant, controller, scenario.duration

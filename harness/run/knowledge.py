@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import final
 
 from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
@@ -54,45 +55,48 @@ def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> Rob
     return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
 
 
-def trained_on(
-    knowledge: RobotKnowledge, keep: Path | None, progress: Progress | None
-) -> Callable[[TrainingConfig], TrainedNetworks]:
-    """Return where a controller that knows a nominal model gets networks that are trained on it, in natural units."""
-    natural = in_natural_units(knowledge)
-    if natural.nominal_jacobian is None:
-        raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
-    return network_source(natural.nominal_jacobian, natural.spec, keep, progress)
+@final
+class NetworkSource:
+    """Networks by training configuration: of this process, read from the cache, or trained on a nominal model.
 
-
-def network_source(
-    nominal_jacobian: JacobianFunction, spec: PlantSpec, keep: Path | None = None, progress: Progress | None = None
-) -> Callable[[TrainingConfig], TrainedNetworks]:
-    """Return a function from a training configuration to its networks: kept, read from the cache, or trained.
-
-    Args:
-        nominal_jacobian: the model to train on.
-        spec: of the plant.
-        keep: results folder in which a copy is kept beside the runs, where that is possible.
-        progress: called with the share that is done while training.
+    Attributes:
+        given: those that a controller asked for.
     """
 
-    def obtain(config: TrainingConfig) -> TrainedNetworks:
+    def __init__(self, nominal_jacobian: JacobianFunction, spec: PlantSpec, progress: Progress | None = None) -> None:
+        """Take the model, the spec of the plant and a function that is called with the share of a training."""
+        self._jacobian, self._spec, self._progress = nominal_jacobian, spec, progress
+        self.given: list[TrainedNetworks] = []
+
+    def __call__(self, config: TrainingConfig) -> TrainedNetworks:
+        """Return the networks of a configuration."""
+
         def make(folder: Path) -> None:
-            save_networks(train(config, nominal_jacobian, spec, progress), folder / FILE)
+            save_networks(train(config, self._jacobian, self._spec, self._progress), folder / FILE)
 
         with one_thread():
-            digest = training_digest(config, nominal_jacobian, spec)
+            digest = training_digest(config, self._jacobian, self._spec)
             key = (cache_folder(NETWORKS), digest)
             if key not in _KEPT:
                 while len(_KEPT) >= NETWORKS_KEPT:
                     _KEPT.pop(next(iter(_KEPT)))
                 _KEPT[key] = load_networks(cached(NETWORKS, digest[:16], make) / FILE, digest)
-        networks = _KEPT[key]
-        if keep is not None:
-            path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"
-            if not path.exists():
-                with contextlib.suppress(OSError):  # a full folder is reported where rows are written
-                    save_networks(networks, path)
-        return networks
+        self.given.append(_KEPT[key])
+        return _KEPT[key]
 
-    return obtain
+
+def trained_on(knowledge: RobotKnowledge, progress: Progress | None) -> NetworkSource:
+    """Return where a controller that knows a nominal model gets networks that are trained on it, in natural units."""
+    natural = in_natural_units(knowledge)
+    if natural.nominal_jacobian is None:
+        raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
+    return NetworkSource(natural.nominal_jacobian, natural.spec, progress)
+
+
+def keep_networks(networks: Iterable[TrainedNetworks], folder: Path) -> None:
+    """Keep copies of networks in a results folder beside the runs, where that is possible."""
+    for each in networks:
+        path = folder / NETWORKS / f"networks-{each.digest[:16]}.npz"
+        if not path.exists():
+            with contextlib.suppress(OSError):  # a full folder is reported where rows are written
+                save_networks(each, path)

@@ -60,14 +60,16 @@ class Steps:
     def jacobian_error(self) -> FloatArray:
         """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k, ...)."""
         with np.errstate(all="ignore"):
-            difference = norm(_flat(self.estimated_jacobian - self.true_jacobian))
-            return np.asarray(difference / norm(_flat(self.true_jacobian)))
+            difference = norm(flat(self.estimated_jacobian - self.true_jacobian))
+            return np.asarray(difference / norm(flat(self.true_jacobian)))
 
     def jacobian_condition(self) -> FloatArray:
         """Return the largest over the smallest singular value of J, (k, ...); infinite where J has lost rank."""
         condition = np.full(self.true_jacobian.shape[:-2], np.nan)
-        known = np.isfinite(_flat(self.true_jacobian)).all(axis=-1)
-        condition[known] = conditions(self.true_jacobian[known])
+        known = np.isfinite(flat(self.true_jacobian)).all(axis=-1)
+        singular = np.linalg.svd(self.true_jacobian[known], compute_uv=False)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            condition[known] = np.where(singular[..., -1] > 0.0, singular[..., 0] / singular[..., -1], np.inf)
         return condition
 
     def table(self, run_id: str, *, full_jacobian: bool = False) -> pd.DataFrame:
@@ -191,12 +193,6 @@ def column_unit(unit: str) -> str:
     return re.sub(r"\W+", "_", unit)
 
 
-def conditions(jacobian: FloatArray) -> FloatArray:
-    """Return the largest over the smallest singular value, (...), of J (..., m, n); infinite where J has lost rank."""
-    singular = np.linalg.svd(jacobian, compute_uv=False)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(singular[..., -1] > 0.0, singular[..., 0] / singular[..., -1], np.inf)
-
-
-def _flat(jacobian: FloatArray) -> FloatArray:
-    return jacobian.reshape(*jacobian.shape[:-2], jacobian.shape[-2] * jacobian.shape[-1])
+def flat(values: FloatArray) -> FloatArray:
+    """Return values (..., m, n) as (..., m n)."""
+    return values.reshape(*values.shape[:-2], values.shape[-2] * values.shape[-1])

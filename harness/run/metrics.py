@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.harness.run.log import Steps
+from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, transposed
@@ -216,11 +216,6 @@ def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.ascontiguousarray(np.moveaxis(values, 0, -1))
 
 
-def _flat(values: FloatArray) -> FloatArray:
-    """Return values (..., n, k) as (..., n k)."""
-    return values.reshape(*values.shape[:-2], -1)
-
-
 def _peak(run: Judged, values: FloatArray) -> FloatArray:
     return np.asarray(np.abs(values).max(axis=(-2, -1))) if values.size else run.same(np.nan)
 
@@ -300,7 +295,7 @@ _ALL: Final = (
     Metric(
         "control_effort_rad", "rad", "control effort", 2,
         "sum of |u| dt over joints and rows",
-        lambda run: _flat(np.abs(run.command)).sum(axis=-1) * run.period,
+        lambda run: flat(np.abs(run.command)).sum(axis=-1) * run.period,
         tables={"cost": "Joints", "runs": "Motion"}, figure="effort",
     ),
     Metric(
@@ -318,7 +313,7 @@ _ALL: Final = (
     Metric(
         "joint_acceleration_rms_rad_s2", "rad/s²", "RMS acceleration", 2,
         "root of the mean of a² over joints and rows",
-        lambda run: _rms(run, _flat(run.acceleration)),
+        lambda run: _rms(run, flat(run.acceleration)),
         tables={"cost": "Joints"}, figure="smoothness",
     ),
     Metric(
@@ -329,7 +324,7 @@ _ALL: Final = (
     Metric(
         "joint_jerk_rms_rad_s3", "rad/s³", "RMS jerk", 1,
         "root of the mean of j² over joints and rows",
-        lambda run: _rms(run, _flat(run.jerk)),
+        lambda run: _rms(run, flat(run.jerk)),
         tables={"cost": "Joints"}, figure="smoothness",
     ),
     Metric(
