@@ -16,8 +16,8 @@ import pytest
 from hypothesis import settings
 
 SLOW = {  # folders and files whose tests are all slow
-    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_exit_codes", "test_fmu_model", "test_groups",
-    "test_integrity", "test_outcome",
+    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_exit_codes", "test_fmu_model",
+    "test_fmu_standard", "test_groups", "test_integrity", "test_outcome", "test_wrong_inputs",
 }  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.

@@ -123,7 +123,7 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
                 kept[name] = frozenset([digest(folder / name)])
             if wrong and name in (RUNS, STEPS):
                 yield f"{folder / name} {wrong}: runs that are in no part are carried out again"
-        keep_sums(folder, kept, list(kept))
+        keep_sums(folder, kept)
         for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # remains of a process that was killed
             if PARTIAL.fullmatch(path.name):
                 path.unlink()

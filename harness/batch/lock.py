@@ -65,12 +65,13 @@ class Holder:
         return self.host == platform.node() and self.started != _start_of(self.pid)
 
 
+@dataclass(frozen=True)
 class Lock:
     """A lock that this process holds."""
 
-    def __init__(self, file: Path, descriptor: int, stale: Holder | None) -> None:
-        """Take note of the open file, and of the holder before, which ended without giving the lock back."""
-        self._file, self._descriptor, self.stale = file, descriptor, stale
+    file: Path
+    descriptor: int  # of the open file
+    stale: Holder | None  # the holder before, which ended without giving the lock back
 
     def check(self) -> None:
         """Refuse to go on in a folder that is another one by now.
@@ -78,8 +79,8 @@ class Lock:
         Raises:
             FileNotFoundError: the folder was removed, or removed and made again by another process.
         """
-        if not _same(self._file, self._descriptor):
-            raise FileNotFoundError(errno.ENOENT, "it was removed by another process", str(self._file.parent))
+        if not _same(self.file, self.descriptor):
+            raise FileNotFoundError(errno.ENOENT, "it was removed by another process", str(self.file.parent))
 
 
 @contextlib.contextmanager

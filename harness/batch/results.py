@@ -184,8 +184,7 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
         write_vouched(folder, files)
         count = tables.row_count(folder, RUNS)
         if count >= wanted:
-            own = [MANIFEST, *files]
-            keep_sums(folder, {name: frozenset([digest(folder / name)]) for name in own}, own)
+            keep_sums(folder, {name: frozenset([digest(folder / name)]) for name in [MANIFEST, *files]})
             shutil.rmtree(folder / PARTS)
     return count
 

@@ -198,7 +198,7 @@ class Sandbox:
                     (hear or answer.items.append)(_read(content))
         except (EOFError, OSError):
             silence = Ending(CRASHED, LOST)
-        self._drop()
+        self.end(0.0)  # it is gone or of no use, and nothing may wait for it when this process ends
         return Answer(answer.items, End(silence, certain=False, alone=True))
 
     def ask_to_end(self) -> None:
@@ -208,12 +208,17 @@ class Sandbox:
             if self._process is not None:
                 self._process.terminate()
 
-    def end(self) -> None:
-        """Wait until the guard has ended."""
+    def end(self, patience: float = STOP_TIME) -> None:
+        """End a guard, and the processes below it if it has not ended by itself within a time [s]."""
         with self._lock:
-            if self._process is not None:
-                self._process.join(STOP_TIME)
-                self._kill(self._process)
+            process, self._process, self._link = self._process, None, None
+            if process is None:
+                return
+            process.join(patience)
+            if process.is_alive() and process.pid is not None:
+                processes.send(processes.descendants(process.pid), signal.SIGKILL)
+            process.kill()
+            process.join()
 
     def _wait(self, link: Connection) -> Ending | None:
         """Wait for a message; return why there will be none."""
@@ -246,24 +251,10 @@ class Sandbox:
         theirs.close()
         if fault := _start_fault(ours):
             ours.close()
-            self._drop()
+            self.end(0.0)
             raise ConfigurationError(fault)
         self._link = ours
         return ours
-
-    def _drop(self) -> None:
-        """End a guard that is gone or of no use, so that nothing waits for it when this process ends."""
-        with self._lock:
-            if self._process is not None:
-                self._kill(self._process)
-            self._process = self._link = None
-
-    @staticmethod
-    def _kill(process: BaseProcess) -> None:
-        if process.is_alive() and process.pid is not None:
-            processes.send(processes.descendants(process.pid), signal.SIGKILL)
-        process.kill()
-        process.join()
 
 
 def _start_fault(link: Connection) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -62,9 +62,9 @@ def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
         sync(folder)
 
 
-def keep_sums(folder: Path, sums: Sums, names: Collection[str]) -> None:
-    """Write the file anew with the lines of some names only."""
-    kept = [f"{each}  {name}\n" for name in names for each in sorted(sums.get(name, ()))]
+def keep_sums(folder: Path, sums: Sums) -> None:
+    """Write the file anew with these lines only."""
+    kept = [f"{each}  {name}\n" for name, digests in sums.items() for each in sorted(digests)]
     write_atomically(folder / SUMS, lambda file: file.write_text("".join(kept), encoding="utf-8"))
 
 

@@ -72,6 +72,13 @@ def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
     assert before["estimator_updated"] == 0.0
 
 
+@pytest.mark.parametrize("estimator", LEARNING[:2])
+def test_a_motion_that_is_just_large_enough_is_used(estimator):
+    run = Learning(estimator, np.ones((1, 2)))
+    run.update(motion([0.01, 0.0], [0.5]))
+    assert run.diagnostics()["estimator_updated"] == 1.0
+
+
 @pytest.mark.parametrize(
     ("estimator", "jacobian", "dq", "expected"),
     [

@@ -269,6 +269,25 @@ def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     assert made.state.delay == made.stages.pairing.delays[3]
 
 
+def test_each_half_alone_makes_up_for_its_part():
+    """`delay` brings the feature to the present, `response` to where the commands so far will lead."""
+    rng = np.random.default_rng(0)
+    made = {
+        "delay": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5), 2), Delays(0.1, 0.0, 0.0), delay="given"),
+        "response": Seeing(ToyArm(np.eye(M), (0.0, 0.5, 0.5)), NO_DELAYS, response="identified"),
+    }
+    for k in range(40):
+        step = 0.05 * rng.uniform(-1.0, 1.0, N)
+        for half, each in made.items():
+            bound = each.predict()
+            if k > 20:
+                expected = each.arm.end() if half == "response" else A @ each.arm.q
+                np.testing.assert_allclose(bound.feature, expected, atol=1e-3)
+                assert (bound.lead > 1.0) == (half == "response")
+                np.testing.assert_array_equal(bound.joint_position == each.look.joint_position, half == "delay")
+            each.send(step)
+
+
 def test_the_shifted_reference_is_interpolated_and_goes_on():
     reference = np.array([[0.0], [1.0], [4.0], [5.0]])
     for lead, expected in ((0.0, [0.0, 1.0]), (1.5, [2.5, 4.5]), (2.25, [4.25, 5.25]), (7.5, [9.5, 10.5])):

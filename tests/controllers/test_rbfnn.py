@@ -200,6 +200,15 @@ def test_the_commanded_position_may_stand_in_for_the_measured_one():
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-9)
 
 
+def test_anti_windup_lessens_the_overshoot_of_a_limited_loop():
+    J, target = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]]), np.array([1.0, 0.8])
+    with_it, without = (
+        run_affine(law(network(), limit=0.3, anti_windup=on, k=0.2), J, target, 400, limit=0.3)[1]
+        for on in (True, False)
+    )
+    assert with_it < without
+
+
 def test_weight_norms_are_reported():
     made = law(network(), limit=1e-3)
     made.command(ONES, seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))

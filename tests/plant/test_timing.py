@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from kit.plants import configure, setup
+from kit.plants import NEEDS_BULLET, configure, setup
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.sensing import SensingConfig
@@ -63,6 +63,20 @@ def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
     for joints, features in walks.values():
         np.testing.assert_allclose(joints, walks[250][0], rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(features, walks[250][1], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+@NEEDS_BULLET
+def test_the_rendered_world_is_the_same_at_two_rates():
+    entry, walks = find_plant("bullet"), []
+    late = {"command_delay": 0.05, "latency": 0.07, "drop_probability": 0.0, "depth_noise": "none", "scenery": False}
+    for rate in (10, 20):
+        plant = entry.build(configure(entry.config, **late), setup("moderate", 1.0 / rate))
+        walks.append(every(run(plant, rate), rate))
+        plant.close()
+    for one, other in zip(*walks, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-9)
+        assert np.ptp(one, axis=0).max() > 0.05
 
 
 @pytest.mark.parametrize("rate", RATES)
