@@ -283,7 +283,7 @@ def test_each_half_alone_makes_up_for_its_part():
             if k > 20:
                 expected = each.arm.end() if half == "response" else A @ each.arm.q
                 np.testing.assert_allclose(bound.feature, expected, atol=1e-3)
-                assert (bound.lead > 1.0) == (half == "response")
+                assert (each.lead > 1.0) == (half == "response")
                 np.testing.assert_array_equal(bound.joint_position == each.look.joint_position, half == "delay")
             each.send(step)
 
