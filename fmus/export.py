@@ -117,11 +117,11 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
 def fingerprint(options: ExportOptions) -> str:
     """Return a hash of all that an FMU is made from, without making it.
 
-    These are the files of the packages `fmus` and `plant`, the exporter's and CasADi's version, the options and their
-    numbers, and of a set-up that is not one of `plant.cameras` its equations.
+    These are the files of the packages `fmus` and `plant`, the versions of the exporter, CasADi and fmpy, the options
+    and their numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [tool(), version("casadi"), CODE, options.platforms, options.fmi_version]
+    parts: list[object] = [tool(), version("casadi"), version("fmpy"), CODE, options.platforms, options.fmi_version]
     parts += [options.title, options.identifier, options.summary]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]

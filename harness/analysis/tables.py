@@ -66,19 +66,9 @@ TAIL: Final = 0.95
 Row: TypeAlias = "dict[str, Cell]"
 BAND: Final = ("settling_band", "feature_unit")
 SWEEP_COLUMNS: Final = (
-    "plant",
-    "mismatch",
-    *(short.column for short in SHORT_NAMES.values()),
-    "sensing",
-    "task",
-    "controller",
-    "status",
-    "outcome",
-    "settling_time_s",
-    "task_kind",
-    "rms_error_evaluated",
-    *BAND,
-)  # columns that `sweep_tables` and `outcome_legend` read
+    "plant", "mismatch", *(short.column for short in SHORT_NAMES.values()), "sensing", "task", "controller", "status",
+    "outcome", "settling_time_s", "task_kind", "rms_error_evaluated", *BAND,
+)  # columns that `sweep_tables` and `outcome_legend` read # fmt: skip
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 
@@ -212,11 +202,10 @@ def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
-        kind = (
-            CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
-        )  # its own metrics stand before the common ones
-        summaries = [(column, metric.summary) for wanted in (kind, None) for column, metric in METRICS.items()
-                     if metric.summary and metric.summary.kind == wanted]  # fmt: skip
+        kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
+        known = [(column, metric.summary) for column, metric in METRICS.items() if metric.summary]
+        own_first = sorted(known, key=lambda pair: pair[1].kind is None)
+        summaries = [(column, summary) for column, summary in own_first if summary.kind in (kind, None)]
         rows = []
         for name, own in place.groupby("controller", sort=False):
             row = {"controller": str(name), "outcome": _shares(own)}

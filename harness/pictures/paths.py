@@ -22,11 +22,8 @@ LINE: Final = 0.17  # [in] of the legend
 SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
 ROOM: Final = 1.16  # of a view over the paths in it
 ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
-CAMERA_FRAME: Final = {
-    "x_m": "x, to the right [m]",
-    "y_m": "y, downwards [m]",
-    "z_m": "z, depth [m]",
-}  # of a feature in the frame of the camera
+# Labels of a feature in the frame of the camera.
+CAMERA_FRAME: Final = {"x_m": "x, to the right [m]", "y_m": "y, downwards [m]", "z_m": "z, depth [m]"}
 PIXELS: Final = "px"  # unit of a feature in an image, where the second one of a pair points down
 
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from kit import console
 from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
 from kit.foreign_fmu import build_crane
+from kit.own import install
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.cli.main import app
 from servobench.harness.config import registry
@@ -87,7 +88,7 @@ def test_everything_registered_has_a_row_and_nothing_else_has():
 def installed(tmp_path, monkeypatch):
     """Installs the example of a page as pip would: its module and its entry points on the path."""
 
-    def install(text):
+    def install_example(text):
         project, code = tomllib.loads(blocks(text, "toml")[0])["project"], blocks(text, "python")[0]
         module = project["name"].replace("-", "_")
         points = [
@@ -104,7 +105,7 @@ def installed(tmp_path, monkeypatch):
         registry._load.cache_clear()
 
     modules = []
-    yield install
+    yield install_example
     monkeypatch.undo()
     forget()
     for module in modules:
