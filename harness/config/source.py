@@ -162,9 +162,11 @@ def is_users(file: str) -> bool:
     if file.startswith("<"):
         return file.startswith("<ipython")
     path = Path(file)
+    if path.is_relative_to(ENGINE):
+        return False
     folders = [folder for folder in _libraries() if path.is_relative_to(folder)]
-    if path.is_relative_to(ENGINE) or not folders:
-        return not path.is_relative_to(ENGINE)
+    if not folders:
+        return True
     package = path.relative_to(max(folders, key=len)).parts[0].removesuffix(".py")
     return package in NAMED or package in _plugin_packages()
 
