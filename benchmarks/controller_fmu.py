@@ -6,11 +6,12 @@ import sys
 import tempfile
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from measuring import asked_to_be_quick, microseconds, processor_time, table
-from servobench.controllers.controller import Controller, RobotKnowledge
+from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
 from servobench.fmus.compiler import this_platform
 from servobench.harness.config.entries import NoSettings
@@ -35,8 +36,8 @@ def measured(name: str, folder: Path) -> tuple[list[float], float, int]:
     model = controller_model(request, Settings())
     path = model.product(2).write(folder / f"{model.identifier}.fmu", (this_platform(),))
     experiment = build(resolve(request, Settings()))
-    plant, original = experiment.plant, experiment.controller
-    plugged = mapped_controller(path, name).build(NoSettings(), knowledge_of(original))
+    plant, original = experiment.plant, cast(ServoController, experiment.controller)
+    plugged = mapped_controller(path, name).build(NoSettings(), original.servo.knowledge)
     rows = 1 + experiment.run.preview_rows
     desired = experiment.scenario.reference.sampled(plant.spec.period, PERIODS + rows)
     references = [desired[k : k + rows] for k in range(PERIODS)]
@@ -54,13 +55,6 @@ def measured(name: str, folder: Path) -> tuple[list[float], float, int]:
     times = [processor_time(partial(go, each), 1) / PERIODS for each in (original, plugged)]
     plant.close()
     return times, worst, model.recorded.states
-
-
-def knowledge_of(controller: Controller) -> RobotKnowledge:
-    """Return what a composed controller knows of the robot."""
-    if not isinstance(controller, ServoController):
-        raise TypeError(f"wanted a composed controller, got {type(controller).__name__}")
-    return controller.servo.knowledge
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -37,10 +38,7 @@ def true_model(word: str, seed: int) -> SetupModel:
     """Return a true UR5 and its cameras."""
     drawn = named_seed(seed, "mismatch")
     arm, sample = sample_mismatch(MODERATE, ROBOT, drawn)
-    model, _ = Sensing.parse(word).true(ROBOT, arm, sample, MODERATE, drawn)
-    if not isinstance(model, SetupModel):
-        raise TypeError(f"sensing {word} has no pixels")
-    return model
+    return cast(SetupModel, Sensing.parse(word).true(ROBOT, arm, sample, MODERATE, drawn)[0])
 
 
 def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, float]:

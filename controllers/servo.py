@@ -159,9 +159,8 @@ class Servo:
             past = self.estimation.pairing.past(
                 estimation.learned.pair, observation.joint_position, self.predictor.window
             )
-            predictor, bound = self.predictor.predict(predictor, J, past, observation)
-            ahead = observation.with_values(bound.joint_position, bound.feature)
-            later = shifted(reference, bound.lead, self._rows)
+            predictor, ahead, lead = self.predictor.predict(predictor, J, past, observation)
+            later = shifted(reference, lead, self._rows)
         forward: FloatArray = np.zeros(())
         if self._feeds_forward:
             forward = later[..., 1, :] - later[..., 0, :]

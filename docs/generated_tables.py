@@ -67,8 +67,8 @@ def renewed(page: Path) -> str:
         "studies": lambda _: studies_table(),
         "methods": lambda part: presets_table() if part[3] == "presets" else methods_table(),
         "options": lambda _: options_table(),
-        "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
-        "stored": lambda part: stored_table(part[3], page.parent) or part[4].strip("\n"),
+        "table": lambda part: measured_table(part, page.parent),
+        "stored": lambda part: measured_table(part, page.parent),
     }
     text = page.read_text(encoding="utf-8")
     return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
@@ -147,32 +147,23 @@ def aids_in_words(aids: AidsConfig) -> str:
     return "all" + (f", but {', '.join(words)}" if other else "")
 
 
-def measured_table(name: str, folder: Path) -> str:
-    """Return a table of docs/tables with a line that says when it was made; nothing before its study was carried out.
+def measured_table(part: re.Match[str], folder: Path) -> str:
+    """Return a table of docs/tables or its number of rows, and how it was made; the part as it is before its study.
 
     Args:
-        name: of the table.
+        part: of the page, which names the table.
         folder: of the page, from which its links go.
     """
-    path = stored_tables.FOLDER / f"{name}.csv"
+    path = stored_tables.FOLDER / f"{part[3]}.csv"
     if not path.exists():
-        return ""
-    rows = stored_tables.read(path).table
-    cells = [tuple(row) for row in rows.itertuples(index=False)]
-    return f"{table(tuple(rows.columns), cells)}\n\n{origin(path, folder)}"
-
-
-def stored_table(name: str, folder: Path) -> str:
-    """Return a line that links to a table of docs/tables; nothing before its study was carried out."""
-    path = stored_tables.FOLDER / f"{name}.csv"
-    return f"All {len(stored_tables.read(path).table)} rows: {origin(path, folder)}" if path.exists() else ""
-
-
-def origin(path: Path, folder: Path) -> str:
-    """Return how a stored table was made, with a link to it from a page in `folder`."""
-    stamp = stored_tables.read(path).stamp
+        return part[4].strip("\n")
+    stamp, rows = stored_tables.read(path)
     made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
-    return f"`make results ONLY={stamp['study']}`: {made}; [commands]({Path(os.path.relpath(path, folder)).as_posix()})"
+    link = f"[commands]({Path(os.path.relpath(path, folder)).as_posix()})"
+    origin = f"`make results ONLY={stamp['study']}`: {made}; {link}"
+    if part[2] == "stored":
+        return f"All {len(rows)} rows: {origin}"
+    return f"{table(tuple(rows.columns), [tuple(row) for row in rows.itertuples(index=False)])}\n\n{origin}"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name

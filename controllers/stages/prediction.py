@@ -93,20 +93,6 @@ class FeatureFilter(NamedTuple):
         return branch(square > RESTART_RATIO * innovation_variance, FeatureFilter.restart, corrected, feature)
 
 
-class Prediction(NamedTuple):
-    """The prediction that a law gets in place of the observation.
-
-    Attributes:
-        feature: ŷ, (..., m).
-        joint_position: q̂, (..., n), rad.
-        lead: (...) [periods] by which the reference is to be shifted, a fraction.
-    """
-
-    feature: FloatArray
-    joint_position: FloatArray
-    lead: FloatArray
-
-
 class PredictorState(NamedTuple):
     """The state of the predict stage.
 
@@ -160,8 +146,8 @@ class Predictor:
 
     def predict(
         self, state: PredictorState, jacobian: FloatArray, past: Past, observation: Observation
-    ) -> tuple[PredictorState, Prediction]:
-        """Return the new state and the prediction of this period."""
+    ) -> tuple[PredictorState, Observation, FloatArray]:
+        """Return the new state, ŷ and q̂ as the observation that a law gets, and lead, (...) [periods], a fraction."""
         q, response, lead = observation.joint_position, state.response, np.zeros_like(state.filter.variance)
         bound = q
         if self._aids.response != "ignored":
@@ -172,7 +158,7 @@ class Predictor:
         if self._aids.filter:
             found = self._observe(state, past, jacobian, observation)
         feature = found.feature + np.matvec(jacobian, bound - past.exposed)
-        return PredictorState(response, found, past.delay), Prediction(feature, bound, lead)
+        return PredictorState(response, found, past.delay), observation.with_values(bound, feature), lead
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
         """Return the state after the joint step (..., n), rad, left the chain."""

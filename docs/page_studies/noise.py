@@ -14,7 +14,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -55,23 +54,14 @@ TITLES: Final = {
 GROUP: Final = 0.84  # width of the boxes of a level
 
 
-@dataclass(frozen=True)
-class SetUp:
-    """A sensing set-up in which the study is carried out.
+class SetUp(NamedTuple):
+    """A sensing set-up in which the study is carried out."""
 
-    Attributes:
-        study: name of the study, of its first table and of its picture.
-        errors: name of its table of the Jacobian's errors.
-        pixel: what 1 px of the original is, in the unit of settings of noise.
-        options: of the sweep, which choose it.
-        where: the set-up in words, after the purpose of the study.
-    """
-
-    study: str
-    errors: str
-    pixel: float
-    options: Words = ()
-    where: str = ""
+    study: str  # name of the study, of its first table and of its picture
+    errors: str  # name of its table of the Jacobian's errors
+    pixel: float  # size of 1 px of the original, in the unit of settings of noise
+    options: Words = ()  # of the sweep, which choose it
+    where: str = ""  # the set-up in words, after the purpose of the study
 
 
 POSITION: Final = SetUp("noise", "noise_jacobian", 0.001)
