@@ -24,11 +24,10 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.noise import draw_directions, family_of, quantise
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
-from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.sensing import SensingConfig, draw_directions, family_of, quantise
 from servobench.plant.contract.signals import BoolArray
 
 TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a window that begins with it

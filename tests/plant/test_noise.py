@@ -11,8 +11,8 @@ import pytest
 from scipy import stats
 
 from kit.plants import configure, mismatched, setup
-from servobench.plant.bench import noise as families
 from servobench.plant.bench.sensor import Spell, begin_probability
+from servobench.plant.contract import sensing as families
 from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, without_disturbance
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
