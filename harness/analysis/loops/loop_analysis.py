@@ -290,7 +290,7 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
         if isinstance(warm.controller, ServoController) and not identify:
             controller = linear_controller(warm, source)
             closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
-            stable, step = is_stable(closed.A), closed.step(m, steps)
+            stable, step = is_stable(closed.A), closed.step(m, arm.period, steps)
             return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
         loop = SmallMotions(warm.controller, arm, warm.rest)
         response = LoopResponse(*controller_response(excite(loop, m + n), arm.period), arm)

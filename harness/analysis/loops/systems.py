@@ -26,7 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -63,13 +63,19 @@ class StateSpace(NamedTuple):
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
         return np.asarray(self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D)
 
-    def step(self, outputs: int, periods: int) -> FloatArray:
+    def as_control(self, period: float) -> Any:  # noqa: ANN401 - python-control has no types
+        """Return the system as a `control.StateSpace` with the sampling period [s]."""
+        import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
+
+        return control.ss(*self, period)
+
+    def step(self, outputs: int, period: float, periods: int) -> FloatArray:
         """Return each of the first outputs after a unit step of the input with its number, (periods, outputs)."""
-        x, y = np.zeros((len(self.A), outputs)), np.zeros((periods, outputs))
-        for k in range(periods):
-            y[k] = np.diagonal(self.C[:outputs] @ x + self.D[:outputs, :outputs])
-            x = self.A @ x + self.B[:, :outputs]
-        return y
+        import control  # noqa: PLC0415 - as above
+
+        system, times = self.as_control(period), np.arange(periods) * period
+        steps = [control.step_response(system, times, input=i, output=i).outputs for i in range(outputs)]
+        return np.stack([np.ravel(step) for step in steps], axis=-1)
 
 
 def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) -> StateSpace:
