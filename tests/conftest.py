@@ -16,8 +16,10 @@ import pytest
 from hypothesis import settings
 
 SLOW = {  # folders and files whose tests are all slow
-    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_exit_codes", "test_fmu_model",
-    "test_fmu_standard", "test_groups", "test_integrity", "test_outcome", "test_wrong_inputs",
+    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_check", "test_drives", "test_engine",
+    "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_integrity", "test_loops",
+    "test_outcome", "test_page_tables", "test_plant_lanes", "test_robot_runs", "test_robots", "test_sensing_runs",
+    "test_setups", "test_units", "test_urdf", "test_verdict", "test_wrong_inputs",
 }  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
