@@ -16,10 +16,11 @@ import pytest
 from hypothesis import settings
 
 SLOW = {  # folders and files whose tests are all slow
-    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_check", "test_drives", "test_engine",
-    "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_integrity", "test_loops",
-    "test_outcome", "test_page_tables", "test_plant_lanes", "test_robot_runs", "test_robots", "test_sensing_runs",
-    "test_setups", "test_units", "test_urdf", "test_verdict", "test_wrong_inputs",
+    "closed_loop", "end_to_end", "test_adapters", "test_blocks", "test_chain", "test_check", "test_drives",
+    "test_engine", "test_exit_codes", "test_fmu_model", "test_fmu_standard", "test_fmu_symbolic", "test_help",
+    "test_integrity", "test_lists", "test_loops", "test_outcome", "test_page_tables", "test_plant_lanes",
+    "test_robot_runs", "test_robots", "test_sensing_runs", "test_setups", "test_units", "test_urdf", "test_verdict",
+    "test_wrong_inputs",
 }  # fmt: skip
 
 # A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
@@ -46,9 +47,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """Return one process more than there are processors, as some tests wait for other processes."""
-    return (os.cpu_count() or 1) + 1
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Return one process more than there are processors, as some of the slow tests wait for other processes."""
+    return (os.cpu_count() or 1) + (not config.option.markexpr)
 
 
 @pytest.hookimpl(optionalhook=True)
