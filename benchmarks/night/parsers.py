@@ -43,6 +43,7 @@ from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolution import check_settings, resolve
+from servobench.plant.contract import checksums
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
@@ -124,7 +125,7 @@ def _description(text: str, folder: Path) -> None:
 
 def _fmu(content: bytes, folder: Path) -> None:
     path = _written(folder / "foreign.fmu", content)
-    _forget(archive._digest, read_description)
+    _forget(checksums._digest, read_description)
     try:
         root = extract_fmu(path)
         refusals = []
