@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[2]
 GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> modules, unit tests
     "kinematics": (
         ("plant/robot/arm.py", "plant/robot/hand_eye.py"),
-        ("plant/test_arm.py", "plant/test_plant_lanes.py"),
+        ("plant/test_arm.py", "plant/test_plant_lanes.py", "plant/test_setups.py"),
     ),
     "estimators": (
         ("controllers/estimators/*.py",),
