@@ -1,7 +1,9 @@
 """One process at a time in a results folder, and who it is.
 
 The lock is `flock` on the file `.lock`, which the system releases when the process ends. The file names its holder.
-On a file system without such locks (some network mounts) nothing keeps two processes apart.
+Where the file system has no such locks (some network mounts), the existence of the file is the lock: the process that
+created it holds it, until that process is known to have ended. The processes of another machine are out of reach, so
+there the file stays until a user removes it.
 """
 
 from __future__ import annotations
@@ -120,20 +122,51 @@ def current_holder(folder: Path) -> Holder | None:
 
 def _acquire(path: Path) -> tuple[int, Holder | None]:
     """Return the descriptor of the locked file, and the holder whose process ended without giving it back."""
+    before = None
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        before = Holder.read(path)
+        before = Holder.read(path) or before
+        descriptor, created = _open(path)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held = True
         except BlockingIOError:
             os.close(descriptor)
-            owner = Holder.read(path) or before or UNREADABLE_OWNER
-            raise ConfigurationError(f"results folder {path.parent} is being written by {owner}") from None
+            raise ConfigurationError(_refusal(path, Holder.read(path) or before)) from None
         except OSError:  # such as ENOLCK of a network mount without a lock service
+            held = created
+        if held and _same(path, descriptor):
             return descriptor, before
-        if _same(path, descriptor):
-            return descriptor, before
-        os.close(descriptor)  # it was given back in this moment
+        os.close(descriptor)
+        if not held and path.exists():
+            _remove_stale(path, before)
+
+
+def _open(path: Path) -> tuple[int, bool]:
+    """Open the file of a lock and return whether it was created."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
+    except FileExistsError:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666), False
+
+
+def _remove_stale(path: Path, holder: Holder | None) -> None:
+    """Remove a file whose existence is the lock, if its process is known to have ended.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if holder is None or not holder.gone:
+        raise ConfigurationError(f"{_refusal(path, holder)}; if it has ended, remove {path} and try again")
+    aside = path.with_name(f"{path.name}-{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):  # another process was quicker
+        path.rename(aside)
+        if Holder.read(aside) != holder:  # and has taken the lock
+            os.link(aside, path)
+        aside.unlink()
+
+
+def _refusal(path: Path, holder: Holder | None) -> str:
+    return f"results folder {path.parent} is being written by {holder or UNREADABLE_OWNER}"
 
 
 def _same(path: Path, descriptor: int) -> bool:
