@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from servobench.harness.cli.terminal import say
 from servobench.plant.contract.faults import ConfigurationError
@@ -36,37 +36,77 @@ class Names(NamedTuple):
 @cache
 def names_of(kind: str) -> Names:
     """Return the names of a kind: plants, controllers, estimators, tasks, mismatch, robot or sensing."""
+    return KINDS[kind]()  # which imports no more than its kind needs, as shells wait for completions
+
+
+def _plants() -> Names:
+    from servobench.harness.config.registry import plant_names
+
+    return Names(plant_names, partial(_choose, "plant"), "plant")
+
+
+def _controllers() -> Names:
     from servobench.controllers.parts import ESTIMATORS
-    from servobench.harness.batch.trials import choose
-    from servobench.harness.config.registry import controller_names, plant_names
-    from servobench.harness.config.robots import find_robot, find_sensing, robot_names, sensing_names
-    from servobench.harness.run.request import read_mismatch
-    from servobench.harness.run.tasks import choose_task, task_names
-    from servobench.plant.robot.mismatch import AXES, PROFILES
+    from servobench.harness.config.registry import controller_names
 
-    def robot(word: str) -> str:
-        if note := find_robot(word).note:
-            say(note)
-        return word
-
-    def controllers(word: str) -> Iterable[str]:
+    def begun(word: str) -> Iterable[str]:
         law, plus, _ = word.partition("+")
         return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
 
-    def mismatches(word: str) -> Iterable[str]:
+    return Names(controller_names, partial(_choose, "controller"), "controller", begun)
+
+
+def _estimators() -> Names:
+    from servobench.controllers.parts import ESTIMATORS
+
+    return Names(lambda: list(ESTIMATORS), str)
+
+
+def _tasks() -> Names:
+    from servobench.harness.run.tasks import choose_task, task_names
+
+    return Names(task_names, choose_task)
+
+
+def _mismatches() -> Names:
+    from servobench.harness.run.request import read_mismatch
+    from servobench.plant.robot.mismatch import AXES, PROFILES
+
+    def begun(word: str) -> Iterable[str]:
         before, plus, _ = word.rpartition("+")
         axes = [f"{before}{plus}{axis}=" for axis in AXES]
         return axes if plus else [*PROFILES, *axes]
 
-    return {
-        "plants": Names(plant_names, partial(choose, "plant"), "plant"),
-        "controllers": Names(controller_names, partial(choose, "controller"), "controller", controllers),
-        "estimators": Names(lambda: list(ESTIMATORS), str),
-        "tasks": Names(task_names, choose_task),
-        "mismatch": Names(lambda: list(PROFILES), read_mismatch, begun=mismatches),
-        "robot": Names(robot_names, robot),
-        "sensing": Names(sensing_names, find_sensing),
-    }[kind]
+    return Names(lambda: list(PROFILES), read_mismatch, begun=begun)
+
+
+def _robots() -> Names:
+    from servobench.harness.config.robots import find_robot, robot_names
+
+    def find(word: str) -> str:
+        if note := find_robot(word).note:
+            say(note)
+        return word
+
+    return Names(robot_names, find)
+
+
+def _sensings() -> Names:
+    from servobench.harness.config.robots import find_sensing, sensing_names
+
+    return Names(sensing_names, find_sensing)
+
+
+KINDS: Final[dict[str, Callable[[], Names]]] = {
+    "plants": _plants, "controllers": _controllers, "estimators": _estimators, "tasks": _tasks,
+    "mismatch": _mismatches, "robot": _robots, "sensing": _sensings,
+}  # fmt: skip
+
+
+def _choose(word: Word, given: str) -> str:
+    from servobench.harness.batch.trials import choose
+
+    return choose(word, given)
 
 
 def completing(kind: str) -> Callable[[str], list[str]]:
