@@ -91,7 +91,13 @@ def _mean(array: Any, axis: Any = None, keepdims: bool = False) -> Traced:  # no
 
 
 def _reduction(name: str) -> Callable[..., Traced]:
-    def reduce(array: Any, axis: Any = None, keepdims: bool = False, initial: Any = None, dtype: Any = None) -> Traced:  # noqa: ANN401
+    def reduce(
+        array: Any,  # noqa: ANN401 - as numpy's, like the others
+        axis: Any = None,  # noqa: ANN401
+        keepdims: bool = False,
+        initial: Any = None,  # noqa: ANN401
+        dtype: Any = None,  # noqa: ANN401
+    ) -> Traced:
         del dtype
         return reduced(name, array, axis, keepdims, initial)
 

@@ -250,7 +250,7 @@ def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -
 
 
 def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
-    """Return the content of a task; the plant and the controller are imported, of one that cannot be the row tells."""
+    """Return the content of a task, and import its plant and controller; the row tells of one that cannot be."""
     sources, content = packed
     for source in sources:
         source.load()

@@ -7,7 +7,7 @@ Answers are data: JSON, which is read and never executed, since code of users ma
 copy of the guard, so that a new one takes milliseconds. It is ended, with every process below the guard, when a run
 takes too long, holds too much memory or kills it; when the code of users changes, so that no plug-in meets the remains
 of another; when a task is over and left processes or much memory behind; and when the link to this process closes,
-also because this process was killed. For Linux only.
+also because this process was killed.
 """
 
 from __future__ import annotations

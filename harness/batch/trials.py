@@ -20,7 +20,7 @@ from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, Registry, find_controller, installed_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
-from servobench.harness.config.source import NAMED, PLACE, place_in_trace
+from servobench.harness.config.source import PLACE, count_as_users, place_in_trace
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolution import resolve
@@ -165,7 +165,7 @@ def _is_foreign(registry: Registry[Any], given: str) -> bool:
         return True
     found = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
     if found is not None and found["module"]:
-        NAMED.add(found["module"].partition(".")[0])
+        count_as_users(found["module"])
     return found is not None
 
 

@@ -105,7 +105,7 @@ def on_bench(
     """
 
     def build(own: PlantSetup) -> World:
-        make: Callable[..., World] = checked(world)
+        make: Callable[..., World] = add_checks(world)
         made = make(config, own) if with_config else make(own)
         _check_spec(made)
         return made
@@ -114,7 +114,7 @@ def on_bench(
     return build_bench(build, setup, delay, sensing)
 
 
-def checked(world: type[World]) -> type[World]:
+def add_checks(world: type[World]) -> type[World]:
     """Return a class of worlds whose joint positions and features are copied, checked and float64.
 
     Its methods raise a `ValueError` about an answer that is no such array, and `PlantDiverged` about one that is not
@@ -187,7 +187,7 @@ class Kind(ABC, Generic[Entry]):
         """Return the entry of a class."""
 
     @abstractmethod
-    def checked(self, entry: Entry, place: str) -> Entry:
+    def check(self, entry: Entry, place: str) -> Entry:
         """Return an entry that was checked, with a guard around the functions of a user.
 
         Raises:
@@ -230,7 +230,7 @@ class Kind(ABC, Generic[Entry]):
         named: Entry = replace(entry, name=name or entry.name)
         if not (isinstance(named.name, str) and NAME.fullmatch(named.name)):
             raise ConfigurationError(f"{place}: the name must be letters, digits and _, got {named.name!r}")
-        return self.checked(named, place)
+        return self.check(named, place)
 
 
 class _ControllerKind(Kind[ControllerEntry]):
@@ -248,7 +248,7 @@ class _ControllerKind(Kind[ControllerEntry]):
         build = Guarded(partial(copy_of, given), Controller, with_config=False)
         return ControllerEntry(own.__name__, summary_of(own), NoSettings, build)
 
-    def checked(self, entry: ControllerEntry, place: str) -> ControllerEntry:
+    def check(self, entry: ControllerEntry, place: str) -> ControllerEntry:
         check_settings(entry.config, place)
         return replace(entry, build=_guarded(entry.build, Controller))
 
@@ -266,7 +266,7 @@ class _PlantKind(Kind[PlantEntry]):
         own_robot = bool(given.own_robot)
         return PlantEntry(given.__name__, summary_of(given), config or default, build, own_robot=own_robot)
 
-    def checked(self, entry: PlantEntry, place: str) -> PlantEntry:
+    def check(self, entry: PlantEntry, place: str) -> PlantEntry:
         check_settings(entry.config, place)
         needs: object = entry.needs
         if not isinstance(needs, tuple):

@@ -29,8 +29,8 @@ PLACE: Final = re.compile(
     r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
 )
 PACKAGE = "servobench"
-ENGINE: Final = Path(__file__).parents[2]  # folder of this package
-NAMED: Final[set[str]] = set()  # top-level modules that users named
+PACKAGE_FOLDER: Final = Path(__file__).parents[2]
+_MODULES_OF_USERS: Final[set[str]] = set()  # top-level modules that users named
 
 
 @dataclass(frozen=True)
@@ -162,13 +162,13 @@ def is_users(file: str) -> bool:
     if file.startswith("<"):
         return file.startswith("<ipython")
     path = Path(file)
-    if path.is_relative_to(ENGINE):
+    if path.is_relative_to(PACKAGE_FOLDER):
         return False
     folders = [folder for folder in _libraries() if path.is_relative_to(folder)]
     if not folders:
         return True
     package = path.relative_to(max(folders, key=len)).parts[0].removesuffix(".py")
-    return package in NAMED or package in _plugin_packages()
+    return package in _MODULES_OF_USERS or package in _plugin_packages()
 
 
 @cache
@@ -208,6 +208,11 @@ def _can_import(module: str) -> bool:
         return False
 
 
+def count_as_users(module: str) -> None:
+    """Let a module that a user names count as code of users, though it lies among installed packages."""
+    _MODULES_OF_USERS.add(module.partition(".")[0])
+
+
 def import_user_module(module: str) -> ModuleType:
     """Import a module that a user named; modules in the present folder can be imported, too.
 
@@ -215,7 +220,7 @@ def import_user_module(module: str) -> ModuleType:
         ConfigurationError: it cannot be imported; one line with the place in it.
     """
     make_importable(Path.cwd())
-    NAMED.add(module.partition(".")[0])
+    count_as_users(module)
     try:
         return importlib.import_module(module)
     except (Exception, SystemExit) as error:

@@ -242,12 +242,12 @@ def _assemble(
     try:
         if robot is None:
             knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
-            trains = knowledge if knowledge.nominal_jacobian is not None else None
+            trained = None if knowledge.nominal_jacobian is None else knowledge
         else:
             nominal = find_sensing(request.sensing).nominal(robot)
             knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
-            trains = in_view(knowledge, nominal, robot) if robot.known else None
-        source = None if trains is None else trained_on(trains, progress)
+            trained = in_view(knowledge, nominal, robot) if robot.known else None
+        source = None if trained is None else trained_on(trained, progress)
         true_model = plant.true_model if robot is None else lambda: plant.with_delays(_equations(true))
         knowledge = replace(knowledge, train=source)
         controller = _build_controller(request.controller, resolved.controller, knowledge, true_model)

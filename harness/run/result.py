@@ -15,7 +15,7 @@ from multiprocessing import parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from servobench.harness.config.source import ENGINE, is_users
+from servobench.harness.config.source import PACKAGE_FOLDER, is_users
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
-HARNESS = str(ENGINE / "harness")
+HARNESS = str(PACKAGE_FOLDER / "harness")
 
 
 class WrongAnswer(TypeError):
@@ -126,11 +126,8 @@ def _behind(error: BaseException) -> BaseException:
     behind = error
     while isinstance(behind, ConfigurationError) and behind.__cause__ is not None:
         behind = behind.__cause__
-    return (
-        behind
-        if any(is_users(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(behind.__traceback__))
-        else error
-    )
+    files = (frame.f_code.co_filename for frame, _ in traceback.walk_tb(behind.__traceback__))
+    return behind if any(map(is_users, files)) else error
 
 
 def _place(error: BaseException) -> _Place | None:
@@ -140,7 +137,7 @@ def _place(error: BaseException) -> _Place | None:
     frames = list(traceback.walk_tb(error.__traceback__))
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and is_defect(error):
-        own = [(frame, line) for frame, line in frames if Path(frame.f_code.co_filename).is_relative_to(ENGINE)]
+        own = [(frame, line) for frame, line in frames if Path(frame.f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
     if not own:
         return None
     frame, line = own[-1]

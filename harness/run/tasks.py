@@ -272,7 +272,7 @@ class _TaskKind(Kind[TaskEntry]):
         check_settings(given, given.__name__)
         return TaskEntry(given.__name__, summary_of(given), given())
 
-    def checked(self, entry: TaskEntry, place: str) -> TaskEntry:
+    def check(self, entry: TaskEntry, place: str) -> TaskEntry:
         default: object = entry.default
         if not (isinstance(default, Task) and is_dataclass(type(default))):
             raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got "

@@ -12,7 +12,7 @@ import servobench
 from kit.resting import Resting
 from servobench.controllers.controller import Controller
 from servobench.harness.batch import results
-from servobench.harness.config.source import ENGINE
+from servobench.harness.config.source import PACKAGE_FOLDER
 from servobench.harness.run.result import Ending, RunResult, log_entry
 from servobench.plant.contract.faults import FilterDiverged, RunFault
 from servobench.plant.contract.signals import Command
@@ -136,7 +136,7 @@ def defect():
 
 def test_a_fault_of_this_package_has_no_place_and_a_defect_of_it_has_one():
     code = {"FilterDiverged": FilterDiverged}
-    exec(compile(PACKAGE_CODE, str(ENGINE / "filter.py"), "exec"), code)
+    exec(compile(PACKAGE_CODE, str(PACKAGE_FOLDER / "filter.py"), "exec"), code)
     assert Ending.of(code["caught"](code["fault"])) == Ending("filter_diverged", "not finite")
     ending = Ending.of(code["caught"](code["defect"]))
     assert (ending.status, ending.reason) == ("crashed", "KeyError: 'x' (filter.py:12 in defect)")
