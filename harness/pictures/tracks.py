@@ -37,7 +37,7 @@ MIN_SHARE = 0.2  # of a run that a figure shows at least
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What is shown of runs of a task, as their row in the table of runs says."""
+    """Unit, band and kind in which runs of a task are shown, by their rows in the table of runs."""
 
     row: Mapping[str, Any]  # of the run, or of the first one
 
