@@ -241,8 +241,8 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
 _ALL: Final = (
     Metric(
         "settling_time_s", "s", "settling time", 2,
-        "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row is "
-        "outside, or the error came in less than 0.5 s before the end",
+        "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
+        "is outside, or the error came in less than 0.5 s before the end",
         lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
         tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary("after", 2, "point_to_point"),
     ),
