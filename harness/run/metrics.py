@@ -129,7 +129,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
 
 
 def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> FloatArray:
-    """Return the first time after which `error` stays within `band`.
+    """Return the time from which on `error` stays within `band`, interpolated linearly between two periods.
 
     Args:
         error: (..., k), one value a period [unit of the feature].
@@ -139,10 +139,15 @@ def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> Floa
     Returns:
         (...) [s]; NaN if the error is outside at the end, or came in less than `DWELL` before it.
     """
-    count = error.shape[-1]
-    outside = ~(error <= np.asarray(band)[..., None])
+    count, band = error.shape[-1], np.asarray(band)
+    outside = ~(error <= band[..., None])
     first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
-    return np.where((count - first) * period >= DWELL - 1e-9, first * period, np.nan)
+    settled = (count - first) * period >= DWELL - 1e-9
+    row = np.where(settled, first, 0)[..., None]
+    before, after = (np.take_along_axis(error, rows, axis=-1)[..., 0] for rows in (np.maximum(row - 1, 0), row))
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the first row is inside, or no row stays inside
+        crossing = first - np.where(first > 0, (band - after) / (before - after), 0.0)
+    return np.where(settled, crossing * period, np.nan)
 
 
 def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
@@ -236,8 +241,8 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
 _ALL: Final = (
     Metric(
         "settling_time_s", "s", "settling time", 2,
-        "k·dt of the first row from which on e stays ≤ `settling_band` to the end; NaN if the last row is outside, or "
-        "the error came in less than 0.5 s before the end",
+        "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
+        "is outside, or the error came in less than 0.5 s before the end",
         lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
         tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary("after", 2, "point_to_point"),
     ),

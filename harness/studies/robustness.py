@@ -89,6 +89,8 @@ SENSOR_LINES: Final = (
     Line("lost_frames", "frames lost [%]", parse_magnitudes("lost_frames", "0:80:20%")),
     Line("frame_period", "time between frames [ms]", parse_magnitudes("frame_period", "50:200:50ms")),
     Line("jitter", "frames late by up to [ms]", parse_magnitudes("jitter", "0:200:50ms")),
+    Line("latency_swing", "latency swinging by [ms]", parse_magnitudes("latency_swing", "0:200:50ms")),
+    Line("camera_turn", "camera turning by [°/s]", parse_magnitudes("camera_turn", "0:15:5deg")),
 )
 
 

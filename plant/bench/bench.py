@@ -11,6 +11,7 @@ by side share one bench: their arrays have a leading axis, and each run has rand
 from __future__ import annotations
 
 import copy
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -54,6 +55,7 @@ class BenchState:
         frames: frames under way, oldest first.
         held: (..., m), the last valid feature.
         sensor: its random streams, and the outliers and occlusions that last.
+        camera: (..., 4, 4), pose at the start of a camera that turns; None of others.
         world: the saved state of the world.
     """
 
@@ -62,6 +64,7 @@ class BenchState:
     frames: tuple[Frame, ...]
     held: FloatArray
     sensor: Sensor
+    camera: FloatArray | None
     world: Any
 
 
@@ -69,7 +72,14 @@ class BenchState:
 class Bench(Plant):
     """A plant: a world under clipped and delayed commands, measured with noise, latency and lost frames."""
 
-    def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
+    def __init__(
+        self,
+        world: World,
+        command_delay: float,
+        sensing: SensingConfig,
+        period: float | None = None,
+        camera: FloatArray | None = None,
+    ) -> None:
         """Take a world, which the bench closes; `reset` begins a run. `build_bench` also builds the world.
 
         Args:
@@ -77,10 +87,11 @@ class Bench(Plant):
             command_delay: between a command and its first effect, s, 0 or above.
             sensing: noise, latency, frame period and lost frames.
             period: control period, s; None: that of the world.
+            camera: (..., 4, 4), pose of the first camera in the frame of its mount; None where it is unknown.
 
         Raises:
             ValueError: the control period, the delay, the latency or the frame period is no multiple of the world's
-                period.
+                period, or a camera that is to turn cannot be moved.
         """
         self.world = world
         self._sensing, self._command_delay = sensing, command_delay
@@ -92,6 +103,11 @@ class Bench(Plant):
         self._lower, self._upper = spec.command.lower, spec.command.upper
         self._k = -1
         self._size_masks()
+        self._camera = self._first_camera = camera if sensing.camera_turn > 0.0 else None
+        if sensing.camera_turn > 0.0:
+            if camera is None:
+                raise ValueError("camera_turn needs a camera whose pose is known; leave it at 0 for this plant")
+            world.move_camera(camera)  # refuses it where it cannot be moved
 
     def _size_masks(self) -> None:
         """Set the shapes of commands and masks by the leading axis of the world."""
@@ -127,7 +143,7 @@ class Bench(Plant):
         rest.setflags(write=False)
         self._commands = deque([rest] * self._timing.delays[0])
         self._frames = deque(Frame(due, first, self._all_valid) for due in self._timing.under_way())
-        self._held, self._k = first, 0
+        self._held, self._k, self._camera = first, 0, self._first_camera
         return self._observation(joints, first, self._all_valid)
 
     def step(self, command: Command) -> Observation:
@@ -142,6 +158,8 @@ class Bench(Plant):
         self._commands.append(u)
         timing = self._timing
         for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
+            if self._camera is not None:
+                self.world.move_camera(turned_about_axis(self._camera, self._sensing.camera_turn * i * self._step))
             joints = self.world.advance(self._commands[-1 - delay])
             if timing.exposes(i):
                 self._frames.append(self._sent(i))
@@ -206,7 +224,7 @@ class Bench(Plant):
             valid = np.logical_and(valid, np.logical_not(unseen))
         due: int | FloatArray = step + self._timing.latency
         if self._sensor.jitters:
-            due = self._sensor.due(step + self._timing.latency, self._step)
+            due = self._sensor.due(step, self._timing.latency, self._step)
         return Frame(due, feature, valid)
 
     def truth(self) -> Truth:
@@ -216,7 +234,8 @@ class Bench(Plant):
     def save(self) -> BenchState:
         """See `Plant.save`."""
         sensor = copy.deepcopy(self._sensor)
-        return BenchState(self._k, tuple(self._commands), tuple(self._frames), self._held, sensor, self.world.save())
+        under_way = tuple(self._commands), tuple(self._frames)
+        return BenchState(self._k, *under_way, self._held, sensor, self._camera, self.world.save())
 
     def restore(self, state: BenchState) -> None:
         """See `Plant.restore`.
@@ -227,7 +246,7 @@ class Bench(Plant):
         if state.held.shape != self._all_valid.shape:
             raise ValueError(f"state must be of runs of shape {self.world.lead}, got {state.held.shape[:-1]}")
         self.world.restore(state.world)
-        self._k, self._held = state.period, state.held
+        self._k, self._held, self._camera = state.period, state.held, state.camera
         self._commands, self._frames = deque(state.commands), deque(state.frames)
         self._sensor = copy.deepcopy(state.sensor)
 
@@ -245,6 +264,8 @@ class Bench(Plant):
         self._sensor.keep(lanes)
         commands, frames, self._held = take((tuple(self._commands), tuple(self._frames), self._held), lanes)
         self._commands, self._frames = deque(commands), deque(frames)
+        if self._camera is not None and self._first_camera is not None:
+            self._camera, self._first_camera = self._camera[lanes], self._first_camera[lanes]
 
     def true_model(self) -> TrueModel:
         """See `Plant.true_model`."""
@@ -252,7 +273,8 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        return replace(model, latency=self._sensing.latency, command_delay=self._command_delay, lag=self.world.lag)
+        sensing, delay, lag = self._sensing, self._command_delay, self.world.lag
+        return replace(model, latency=sensing.latency, command_delay=delay, lag=lag, latency_spread=sensing.jitter)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""
@@ -267,11 +289,21 @@ class Bench(Plant):
         shape = (*self.world.lead, 4, 4)
         if X_BC.shape not in (shape, (4, 4)):
             raise ValueError(f"X_BC must have shape {shape}, got {X_BC.shape}")
-        self.world.move_camera(np.broadcast_to(X_BC, shape))
+        pose = np.broadcast_to(X_BC, shape)
+        self._camera = None if self._camera is None else pose
+        self.world.move_camera(pose)
 
     def close(self) -> None:
         """See `Plant.close`."""
         self.world.close()
+
+
+def turned_about_axis(pose: FloatArray, angle: float) -> FloatArray:
+    """Return poses (..., 4, 4) turned about their own z axis by an angle [rad]."""
+    c, s = math.cos(angle), math.sin(angle)
+    turned = np.array(pose)
+    turned[..., 0], turned[..., 1] = c * pose[..., 0] + s * pose[..., 1], c * pose[..., 1] - s * pose[..., 0]
+    return turned
 
 
 def build_bench(
@@ -295,4 +327,4 @@ def build_bench(
         if step == setup.period:
             raise
         raise ValueError(f"in sub-steps of {step:g} s, which the delays and the period need: {error}") from error
-    return Bench(world, command_delay, sensing, setup.period)
+    return Bench(world, command_delay, sensing, setup.period, None if setup.model is None else setup.model.camera)

@@ -2,7 +2,7 @@
 
     y = round_Δ(h(q) + σ·family + outlier)        the features of a frame, round_Δ to multiples of the quantum
     hidden(t) or lost                             a frame that arrives without the feature, or not at all
-    latency + U(0, jitter)                        between exposure and delivery; frames do not overtake each other
+    latency + A (1 + sin(2π t/P)) + U(0, jitter)  between exposure and delivery; frames do not overtake each other
 
 Each part draws from a random stream of its own, frame by frame, so that switching one on changes no other.
 
@@ -17,6 +17,7 @@ and is 0 outside, has the autocovariance s² π (d − h)/d at a lag of h < d fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Final, NamedTuple
@@ -53,7 +54,7 @@ class Sensor:
         Raises:
             ValueError: a negative seed.
         """
-        self._config, self.jitters = config, config.jitter > 0.0
+        self._config, self.jitters = config, config.jitter > 0.0 or config.latency_swing > 0.0
         self._scale = config.noise_factor * config.feature_noise
         stream: Callable[..., Stream] = partial(Stream, seed)
         self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
@@ -92,14 +93,17 @@ class Sensor:
             absent = np.ones_like(self._occlusion.inside)[()]
         return absent if absent is not None and absent.any() else None
 
-    def due(self, step: int, size: float) -> FloatArray:
-        """Return the sub-step after which a frame is delivered that would be due at `step` without jitter, (...).
+    def due(self, step: int, latency: int, size: float) -> FloatArray:
+        """Return the sub-step after which a frame is delivered, (...), a fraction.
 
         Args:
-            step: number of the sub-step.
+            step: number of the sub-step after which it is exposed.
+            latency: without swing and jitter, sub-steps.
             size: of a sub-step, s.
         """
-        self._due = np.maximum(self._due, step + self._config.jitter / size * self._lateness.next())
+        config = self._config
+        swing = config.latency_swing / size * (1.0 + math.sin(2.0 * math.pi * step * size / config.swing_period))
+        self._due = np.maximum(self._due, step + latency + swing + config.jitter / size * self._lateness.next())
         return self._due
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:

@@ -77,6 +77,12 @@ class SensingConfig:
     """[s] length of each of these occlusions."""
     occlusion_windows: tuple[tuple[Number, Number], ...] = ()
     """[s] further occlusions: begin (included, above 0) and end (excluded) of each."""
+    latency_swing: NonNegative = 0.0
+    """[s] A: a frame exposed at t is late by A (1 + sin(2π t/P)) in addition to the latency."""
+    swing_period: Positive = 4.0
+    """[s] P of this swing."""
+    camera_turn: NonNegative = 0.0
+    """[rad/s] the first camera turns about its optical axis, from its pose at the start on."""
 
     def __post_init__(self) -> None:
         """Check the windows."""
@@ -97,6 +103,7 @@ LENGTH: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 SHARE: Final = {"%": 1e-2, "": 1.0}
 NUMBER: Final = {"": 1.0}
 TIME: Final = {"ms": 1e-3, "s": 1.0}
+ANGLE: Final = {"deg": math.pi / 180.0, "rad": 1.0}
 
 
 class SensorAxis(NamedTuple):
@@ -126,6 +133,8 @@ SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {
     "lost_frames": SensorAxis(SHARE, "20%", "drop_probability"),
     "frame_period": SensorAxis(TIME, "100ms", "frame_period"),
     "jitter": SensorAxis(TIME, "100ms", "jitter"),
+    "latency_swing": SensorAxis(TIME, "200ms", "latency_swing"),
+    "camera_turn": SensorAxis(ANGLE, "15deg", "camera_turn"),
 }
 
 

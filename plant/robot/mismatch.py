@@ -31,7 +31,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.sensing import LENGTH, SENSOR_AXES, SHARE, sensor_settings
+from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE, sensor_settings
 from servobench.plant.contract.settings import nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
@@ -289,7 +289,6 @@ def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generat
     return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
 
 
-ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
 PIXELS = {"px": 1.0}
 MAX_SIZE = {"deg": math.pi, "mm": 1.0, "px": 1000.0}  # [rad, m, px] by the first unit of each kind
 AXES = {

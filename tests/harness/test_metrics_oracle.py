@@ -47,10 +47,15 @@ def distance(a, b):
 
 
 def settled(error, band):
-    """The first time from which on all errors are within the band, half a second before the end at the latest."""
+    """The time from which on all errors are within the band, half a second before the end at the latest."""
     for first in range(len(error)):
         if all(value <= band for value in error[first:]):
-            return first * PERIOD if (len(error) - first) * PERIOD >= 0.5 - 1e-9 else math.nan
+            if (len(error) - first) * PERIOD < 0.5 - 1e-9:
+                return math.nan
+            if first == 0:
+                return 0.0
+            slope = (error[first] - error[first - 1]) / PERIOD
+            return (first - 1) * PERIOD + (band - error[first - 1]) / slope
     return math.nan
 
 

@@ -7,11 +7,14 @@ import pickle
 import numpy as np
 import pytest
 
+from kit.plants import configure, mismatched
+from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.bench import Bench
-from servobench.plant.bench.plant import World
+from servobench.plant.bench.plant import PlantSetup, World
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command, PlantSpec, Truth
+from servobench.plant.robot.ur5 import HOME
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 0.5], [-9.0, -9.0], [9.0, 9.0], 0.1)
 QUIET = SensingConfig(0.0)
@@ -66,6 +69,35 @@ def test_a_command_arrives_after_its_delay_and_the_arm_rests_until_then():
 def test_a_feature_arrives_after_its_latency():
     late, prompt = walk(bench(sensing=SensingConfig(0.0, 0.3))), walk(bench())
     assert [o.feature[0] for o in late] == [0.0, 0.0, 0.0, *(o.feature[0] for o in prompt[:-3])]
+
+
+def test_the_latency_of_a_frame_swings_about_its_mean_by_its_time_of_exposure():
+    plant = bench(sensing=SensingConfig(0.0, 0.1, latency_swing=0.2, swing_period=4.0))
+    exposed = 0.1 * np.arange(61)
+    arrival = exposed + 0.3 + 0.2 * np.sin(2 * np.pi * exposed / 4.0)
+    for k, seen in enumerate(walk(plant, np.full((60, 2), 0.5)), 1):
+        arrived = exposed[1:][arrival[1:] <= 0.1 * k + 1e-9]
+        assert seen.feature[0] == pytest.approx(0.5 * arrived.max(initial=0.0))
+        new = ((arrival[1:] > 0.1 * (k - 1) + 1e-9) & (arrival[1:] <= 0.1 * k + 1e-9)).any()
+        assert k <= 1 or bool(seen.feature_valid) == new  # the first frame under way shows the start
+
+
+def test_a_camera_turns_about_its_optical_axis_at_the_same_speed_on_every_plant():
+    model, rate = mismatched("moderate"), 0.3
+    for name in ("kinematic", "fmu"):
+        entry = find_plant(name)
+        config = configure(entry.config, camera_turn=rate, feature_noise=0.0, latency=0.1)
+        plant = entry.build(config, PlantSetup(model, np.array(HOME), 0.05))
+        plant.reset(0)
+        seen = [plant.step(Command(np.full(6, 0.1))) for _ in range(20)]
+        for back, shown in ((0, plant.truth().feature), (2, seen[-1].feature)):  # two periods of latency
+            angle = rate * 0.05 * (20 - back)
+            x, y, z = model.feature(seen[-1 - back].joint_position)
+            turned = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle), z
+            np.testing.assert_allclose(shown, turned, rtol=0, atol=1e-12)
+        plant.close()
+    with pytest.raises(ValueError, match="camera_turn needs a camera whose pose is known"):
+        bench(sensing=SensingConfig(0.0, camera_turn=0.1))
 
 
 def test_noise_has_the_configured_spread_times_its_factor():

@@ -9,9 +9,9 @@ it an arm drifts to its stops in half an hour. A delay or response that is given
 guess where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid.
 A combination that cannot be built has the worst score without a run.
 
-The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: it never looks at the
-camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles around
-the target on the rendered plant, whose joints answer one period earlier.
+The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: by default it ignores
+the camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles
+around the target on the rendered plant, whose joints answer one period earlier.
 """
 
 from __future__ import annotations

@@ -1,0 +1,216 @@
+"""Scores against a reference over many challenges: interquartile means, shared ranks, profiles and their resolution.
+
+A table is tidy: a row a run, with the columns `challenge`, `controller`, `seed` and `score` (0 to 1), for `profile`
+with `value` (an error or a time, less is better) in place of the score. All methods of a table ran on the same robots.
+Sources: Agarwal et al., Deep reinforcement learning at the edge of the statistical precipice, NeurIPS 2021 (rliable);
+Dolan and Moré, Benchmarking optimization software with performance profiles, Mathematical Programming 91, 2002.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from servobench.harness.analysis.statistics import CONFIDENCE, RESAMPLES, Estimate, holm
+from servobench.plant.contract.checks import FloatArray
+
+TRIMMED: Final = 0.25  # share of the scores that an interquartile mean leaves out at each end
+SPLITS: Final = 200  # random halves of the robots from which the resolution is estimated
+LEVEL: Final = 0.05  # of significance
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A method's place among others.
+
+    Attributes:
+        rank: 1 for the first; methods that cannot be told apart from the first one of their rank share it.
+        controller: its name.
+        score: interquartile mean with its interval of 95 %.
+        lost: share of lost runs, which the interquartile mean forgives up to a quarter.
+    """
+
+    rank: int
+    controller: str
+    score: Estimate
+    lost: float
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """How far two random halves of the robots agree; the full set resolves differences half as large.
+
+    Attributes:
+        difference: median over splits and methods of the absolute difference of interquartile means.
+        correlation: mean over splits of Spearman's correlation of the two rankings; NaN where all methods are equal.
+    """
+
+    difference: float
+    correlation: float
+
+
+def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray:
+    """Return min(1, max(reference, floor) / max(own, floor)) of each run.
+
+    Args:
+        own: errors or times, less is better; NaN or +∞ of a lost run, whose score is 0.
+        reference: those of the reference on the same robots; NaN or +∞ where it is lost, which any run outdoes.
+        floor: value below which a difference does not count, above 0.
+
+    Raises:
+        ValueError: a floor that is not above 0.
+    """
+    own, reference, floor = np.broadcast_arrays(
+        *(np.asarray(each, dtype=np.float64) for each in (own, reference, floor))
+    )
+    if not (floor > 0.0).all():
+        raise ValueError(f"floor must be above 0, got {float(np.min(floor))}")
+    known = np.where(np.isfinite(own), np.maximum(own, floor), np.inf)
+    bound = np.where(np.isfinite(reference), np.maximum(reference, floor), known)
+    with np.errstate(invalid="ignore"):  # ∞ / ∞, where both are lost
+        return np.asarray(np.where(np.isinf(known), 0.0, np.minimum(1.0, bound / known)))
+
+
+def interquartile_means(table: pd.DataFrame) -> dict[str, Estimate]:
+    """Return the mean of the middle half of each method's scores over challenges and robots, best first.
+
+    The interval is that of a percentile bootstrap that draws robots anew within each challenge, as rliable does.
+
+    Raises:
+        ValueError: no run, a method without a score on a robot of the others, or two scores on one.
+    """
+    means, drawn = _means_with_resamples(_by_robot(table, "score"))
+    return _estimates(means, drawn, len(table) // len(means))
+
+
+def ranking(table: pd.DataFrame) -> list[Ranked]:
+    """Return the methods by interquartile mean; those that cannot be told apart share a rank.
+
+    Two methods are told apart where the difference of their interquartile means, over its standard deviation in
+    resamples of the same robots, is significant at 5 % after Holm's correction over all pairs. A rank is shared by the
+    methods that cannot be told apart from the best one in it.
+
+    Raises:
+        ValueError: as `interquartile_means`.
+    """
+    by_robot = _by_robot(table, "score")
+    means, drawn = _means_with_resamples(by_robot)
+    estimates = _estimates(means, drawn, len(by_robot))
+    apart = _told_apart(means, drawn)
+    found: list[Ranked] = []
+    for place, (name, estimate) in enumerate(estimates.items(), start=1):
+        shared = found and frozenset((found[found[-1].rank - 1].controller, name)) not in apart
+        rank = found[-1].rank if shared else place
+        found.append(Ranked(rank, name, estimate, float((by_robot[name] == 0.0).mean())))
+    return found
+
+
+def profile(table: pd.DataFrame, factors: Sequence[float]) -> pd.DataFrame:
+    """Return ρ(τ): the share of challenges and robots with a value of at most τ times the best one of all methods.
+
+    Args:
+        table: with a column `value`, NaN of a lost run; apply a floor first where tiny values do not differ.
+        factors: values of τ, at least 1.
+
+    Returns:
+        A row for each factor, a column for each controller.
+
+    Raises:
+        ValueError: a factor below 1, or as `interquartile_means`.
+    """
+    if min(factors, default=1.0) < 1.0:
+        raise ValueError(f"factors must be at least 1, got {min(factors)}")
+    values = _by_robot(table, "value", lost=True)
+    best = values.min(axis=1)
+    rows = [values.le(factor * best, axis=0).mean() for factor in factors]
+    return pd.DataFrame(rows, index=pd.Index(factors, name="factor"))
+
+
+def resolution(table: pd.DataFrame) -> Resolution:
+    """Return how far the interquartile means and ranks of two random halves of the robots agree.
+
+    A robot is in the same half in all challenges, and each challenge is halved.
+
+    Raises:
+        ValueError: a challenge with fewer than two robots, or as `interquartile_means`.
+    """
+    by_robot = _by_robot(table, "score")
+    values, generator = by_robot.to_numpy().T, np.random.default_rng(0)
+    challenges, seeds = (by_robot.index.get_level_values(name).to_numpy() for name in ("challenge", "seed"))
+    numbers, count = np.unique(seeds, return_inverse=True)[1], len(np.unique(seeds))
+    rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
+    if min(map(len, rows)) < 2:
+        raise ValueError("a ranking is split into halves: each challenge needs at least two robots")
+    differences, correlations = [], []
+    for _ in range(SPLITS):
+        order = generator.permutation(count)[numbers]
+        shuffled = [own[np.argsort(order[own])] for own in rows]
+        first, second = (
+            _middle_means(values[:, np.concatenate(half)])
+            for half in ([own[: len(own) // 2] for own in shuffled], [own[len(own) // 2 :] for own in shuffled])
+        )
+        differences.append(np.abs(first - second))
+        correlations.append(pd.Series(first).rank().corr(pd.Series(second).rank()))
+    known = np.array(correlations)[~np.isnan(correlations)]
+    return Resolution(float(np.median(differences)), float(known.mean()) if len(known) else np.nan)
+
+
+def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.DataFrame:
+    """Return a column of a table, a row for each challenge and seed, a column for each controller."""
+    keys = ["challenge", "seed", "controller"]
+    if table.empty:
+        raise ValueError("table must hold at least one run")
+    if (again := table.duplicated(keys)).any():
+        challenge, seed, name = table.loc[again, keys].iloc[0]
+        raise ValueError(f"{name} has several runs of challenge {challenge}, seed {seed}: keep one")
+    known = table.set_index(keys)[column].astype(float)
+    filled = (known.fillna(np.inf) if lost else known).unstack("controller", sort=False)
+    if len(missing := np.argwhere(filled.isna().to_numpy())):
+        (challenge, seed), name = filled.index[missing[0, 0]], filled.columns[missing[0, 1]]
+        raise ValueError(f"{name} lacks the {column} of challenge {challenge}, seed {seed}: methods need the same runs")
+    return filled.where(filled != np.inf) if lost else filled
+
+
+def _middle_means(values: FloatArray) -> FloatArray:
+    """Return the interquartile mean over the last axis."""
+    cut, count = int(TRIMMED * values.shape[-1]), values.shape[-1]
+    return np.asarray(np.partition(values, (cut, count - cut - 1))[..., cut : count - cut].mean(axis=-1))
+
+
+def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.DataFrame]:
+    """Return the interquartile mean of each method, best first, and those of resamples of the robots."""
+    values, generator = np.ascontiguousarray(by_robot.to_numpy().T), np.random.default_rng(0)
+    challenges = by_robot.index.get_level_values("challenge").to_numpy()
+    rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
+    drawn = [
+        _middle_means(values[:, np.concatenate([generator.choice(own, len(own)) for own in rows])])
+        for _ in range(RESAMPLES)
+    ]
+    means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(ascending=False, kind="stable")
+    return means, pd.DataFrame(drawn, columns=by_robot.columns)
+
+
+def _estimates(means: pd.Series[float], drawn: pd.DataFrame, count: int) -> dict[str, Estimate]:
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = drawn.quantile(tail), drawn.quantile(1.0 - tail)
+    return {str(name): Estimate(float(means[name]), float(low[name]), float(high[name]), count) for name in means.index}
+
+
+def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[str]]:
+    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
+
+    pairs = list(combinations(map(str, means.index), 2))
+    p_values = []
+    for first, second in pairs:
+        deviation, difference = float((drawn[first] - drawn[second]).std()), abs(means[first] - means[second])
+        certain = 0.0 if difference > 0.0 else 1.0
+        with np.errstate(under="ignore"):
+            p_values.append(2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain)
+    corrected = holm(p_values)
+    return {frozenset(pair) for pair, p_value in zip(pairs, corrected, strict=True) if p_value < LEVEL}
