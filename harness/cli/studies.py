@@ -302,3 +302,6 @@ def _print_tuned(results: Mapping[str, TunedValues]) -> None:
         spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
         rows.append((name, *(f"{number:.4f}" for number in numbers), spread))
     print_rows(("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies"), rows)
+    for name, tuned in results.items():
+        for edge in tuned.edges:
+            say(f"{name}: {edge}; with these values in use the next study searches a wider box")

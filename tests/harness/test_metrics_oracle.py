@@ -98,6 +98,7 @@ def by_definition(steps, kind):
         "max_error": max(error),
         "rms_error_second_lap": rms([e for e, t in zip(error, times, strict=True) if LAP <= t < 2 * LAP]),
         "rms_error_evaluated": rms([e for e, t in zip(error, times, strict=True) if t >= EVALUATED - 1e-9]),
+        "log_error": sum(max(0.0, math.log10(e / (0.3 * BAND * SPEC.feature.scale))) for e in error) / len(error),
         "path_length_ratio": sum(map(distance, y, y[1:])) / way if way else math.nan,
         "max_joint_position_rad": max(abs(q) for row in steps.joint_position.tolist() for q in row),
         "control_effort_rad": sum(flat[0]) * PERIOD,
