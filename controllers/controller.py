@@ -35,11 +35,13 @@ class Delays:
         latency: s, of the camera.
         command_delay: s, from a command to its first effect.
         lag: s, time constant of the joints' velocity loops.
+        latency_spread: s, by which a frame may be later than the latency.
     """
 
     latency: float
     command_delay: float
     lag: float
+    latency_spread: float = 0.0
 
 
 @dataclass(frozen=True)

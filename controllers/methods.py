@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
-from servobench.controllers.networks.config import TrainingConfig
+from servobench.controllers.networks.config import ControllerTraining, TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
@@ -74,6 +74,7 @@ class Method:
         aids: settings of the aids that differ from none.
         printed: settings of the law as published that differ from its own defaults; None: it is not published.
         estimator_defaults: settings of the estimator that differ from its own defaults where there are aids.
+        network_defaults: those of the controller network's training, likewise.
     """
 
     name: str
@@ -84,13 +85,14 @@ class Method:
     aids: Mapping[str, Any] = field(default_factory=dict)
     printed: Mapping[str, object] | None = None
     estimator_defaults: Mapping[str, object] = field(default_factory=dict)
+    network_defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def divisions(self) -> list[Method]:
         """Return the method best equipped and, where there is one, as published: without aids, its law as printed."""
         if self.printed is None:
             return [self]
         summary = f"{self.summary}; as published, without aids"
-        printed = replace(self, law_defaults=self.printed, aids={}, estimator_defaults={})
+        printed = replace(self, law_defaults=self.printed, aids={}, estimator_defaults={}, network_defaults={})
         return [self, replace(printed, name=self.name + PUBLISHED, summary=summary)]
 
     def config(self) -> MethodConfig:
@@ -99,7 +101,8 @@ class Method:
         parts = estimator.config(**self.estimator_defaults), law.config(**self.law_defaults)
         settings = *parts, InitialConfig(), AidsConfig(**self.aids)
         if law.trained or estimator.trained:
-            return TrainedMethodConfig(*settings, TrainingConfig())
+            training = TrainingConfig(controller=ControllerTraining(**self.network_defaults))
+            return TrainedMethodConfig(*settings, training)
         return MethodConfig(*settings)
 
     def build(self, config: MethodConfig, knowledge: RobotKnowledge) -> ServoController:
@@ -137,7 +140,8 @@ _ROWS = (
     Method(
         "rbfnn_mfac", "rbfnn", "rbf",
         "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
-        {"preview": False}, EQUIPPED, printed={}, estimator_defaults={"leak": 0.1},
+        {"preview": False, "offset_free": True}, EQUIPPED, printed={}, estimator_defaults={"leak": 0.1},
+        network_defaults={"damping": 0.02},
     ),
     Method(
         "map_mfac", "mfac", "constant",

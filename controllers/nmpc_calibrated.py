@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, final
 import casadi
 import numpy as np
 
-from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
+from servobench.controllers.controller import Controller, ControllerEntry, Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.laws.mpc.closed_form import (
     Blocks,
     bridging_shares,
@@ -18,7 +18,7 @@ from servobench.controllers.laws.mpc.closed_form import (
     move_weights,
 )
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
-from servobench.controllers.periods import check_preview, sampled
+from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import SolverFailed
@@ -26,6 +26,7 @@ from servobench.plant.contract.settings import Count, NonNegative, Positive, Pos
 from servobench.plant.contract.signals import Command, Observation
 
 _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
+AGES: Final = 4  # exposures in a control period that are considered where frames are late by unknown times
 
 
 @settings
@@ -46,8 +47,10 @@ class NmpcCalibratedConfig:
     """[1] extra weight of the error at the end, against that of 0.05 s."""
     iterations: Count = 2
     """[1] Gauss-Newton steps per period at most; 1 is the real-time iteration."""
-    disturbance_rate: NonNegative = 0.0
-    """[1/s] with which the model's error at the camera is estimated and fed back; 0 trusts encoders and model."""
+    image: bool = False
+    """Feed the image back (offset-free control); without it the controller trusts encoders and model alone."""
+    image_window: Positive = 0.5
+    """[s] of frames over which the offset of the image from the model is estimated."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
     """[rad/s²] limit of the change between two commands; inf: none."""
     limit_position: bool = True
@@ -66,16 +69,19 @@ class NmpcCalibrated(Controller):
 
     over speed, acceleration and position limits; e = y_ref(0) − h(q̂) − b, β = exp(−decay Δ). Time τ counts blocks of
     length Δ (`Blocks`) from `delay` ahead; after it the joints are taken as ideal: q̂ = q + the steps sent in
-    the last `delay` seconds. b follows the camera, b ← b + γ (y − h(q) − b) with γ = 1 − exp(−disturbance_rate dt);
-    with the default γ = 0 the controller ignores the camera and shows the effect of perfect calibration alone. Each
-    iteration is a Gauss-Newton step: h is linearised along the present plan, at first the last one shifted by one
-    control period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
+    the last `delay` seconds. Each iteration is a Gauss-Newton step: h is linearised along the present plan, at first
+    the last one shifted by one control period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
+
+    Without `image`, b = 0: the effect of perfect calibration alone, which no feedback reaches. With it the control is
+    offset-free: b is the median, component by component, of y − h(q(t − a)) over the frames of `image_window`, with the
+    true age a of each frame, so that fewer than half of them may be outliers. Where frames are late by unknown times, a
+    is the age within the true bounds at which the frame agrees best with the present b.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
     | `plan` | dq_1 … dq_H | (H, n) | rad |
     | `J` | ∂h/∂q along the plan | (H, m, n) | m/rad |
-    | `b` | measured feature minus that of the model | (m,) | m |
+    | `b` | measured feature minus that of the model at the exposure | (m,) | m |
     """
 
     def __init__(self, config: NmpcCalibratedConfig, knowledge: RobotKnowledge) -> None:
@@ -98,7 +104,9 @@ class NmpcCalibrated(Controller):
         self._to_come = bridging_shares(config.delay, period)
         self._along_plan = self._model.map(blocks.count)
         self._shares = decay_shares(blocks.count, config.decay * blocks.length)
-        self._disturbance_share = -math.expm1(-config.disturbance_rate * period)
+        ages = exposure_ages(knowledge.true_delays or Delays(0.0, 0.0, 0.0), period)
+        self._reach = math.ceil(ages[-1])  # periods of the past in which frames were exposed
+        self._exposures = self._reach - ages
         self._change: FloatArray = np.full(n, config.joint_acceleration_limit * blocks.length)
         limited = math.isfinite(config.joint_acceleration_limit)
         self._shape = QpShape(
@@ -112,7 +120,10 @@ class NmpcCalibrated(Controller):
             varying_jacobian=True,
         )
         self._program = QpProgram(self._shape, config.solver)
+        self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
         self._b: FloatArray = np.zeros(m)
+        self._offsets: FloatArray = np.zeros((self._frames, m))
+        self._past: FloatArray | None = None
         self._plan: FloatArray = np.zeros((blocks.count, n))
         self._sent: FloatArray = np.zeros((len(self._to_come), n))
         self._jacobian: FloatArray | None = None
@@ -138,9 +149,8 @@ class NmpcCalibrated(Controller):
         self._knowledge.check(observation, reference)
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
-        if observation.feature_valid:
-            measured = observation.feature / self._knowledge.unit
-            self._b = self._b + self._disturbance_share * (measured - feature - self._b)
+        if self._config.image:
+            self._observe(observation, feature)
         start = present + self._to_come @ self._sent
         rows = sampled(reference / self._knowledge.unit, self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
@@ -172,9 +182,22 @@ class NmpcCalibrated(Controller):
         self._sent = np.zeros((len(self._to_come), n))
         self._last = np.zeros(n)
         self._b = np.zeros(self._spec.m)
+        self._offsets = np.zeros((self._frames, self._spec.m))  # the model counts as right until half of them differ
+        self._past = None
         self._jacobian = None
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
+
+    def _observe(self, observation: Observation, feature: FloatArray) -> None:
+        """Estimate b from a frame, given the feature (m,) of the model at the present joint positions."""
+        self._past = np.tile(feature, (self._reach + 1, 1)) if self._past is None else self._past
+        self._past = np.vstack([self._past[1:], feature])
+        if not observation.feature_valid:
+            return
+        offsets = observation.feature / self._knowledge.unit - sampled(self._past, self._exposures)
+        nearest = offsets[np.linalg.norm(offsets - self._b, axis=-1).argmin()]
+        self._offsets = np.vstack([self._offsets[1:], nearest])
+        self._b = np.median(self._offsets, axis=0)
 
     def _evaluate(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         feature, jacobian = self._model(joint_position)
@@ -226,6 +249,17 @@ class NmpcCalibrated(Controller):
             "fallbacks": float(self._fallbacks),
             "predicted_terminal_error": terminal_error,
         }
+
+
+def exposure_ages(delays: Delays, period: float) -> FloatArray:
+    """Return how old the newest frame may be at a control instant, [periods]: one age, or several, ascending.
+
+    Args:
+        delays: the true ones; a frame that is late by an unknown time also waits for the control instant.
+        period: of control [s].
+    """
+    youngest, spread = in_periods(delays.latency, period), in_periods(delays.latency_spread, period)
+    return np.array([youngest]) if spread == 0.0 else youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
 
 
 def _linearisation(symbolic: Any, n: int, m: int) -> casadi.Function:  # noqa: ANN401 - CasADi expressions

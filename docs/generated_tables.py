@@ -115,14 +115,16 @@ def presets_table() -> str:
     rows = [
         (f"`{name}.{section}.{key}`", toml(value))
         for name in METHODS
-        for section in ("estimator", "law", "initial")
-        for key, value in differences(getattr(registry.find_controller(name).config(), section)).items()
+        for section in ("estimator", "law", "initial", "training")
+        for key, value in differences(getattr(registry.find_controller(name).config(), section, None)).items()
     ]
     return table(("preset", "default"), rows)
 
 
 def differences(config: Any) -> dict[str, Any]:  # noqa: ANN401 - any settings
-    """Return the settings that differ from the defaults of their class."""
+    """Return the settings that differ from the defaults of their class; none of a section that does not exist."""
+    if config is None:
+        return {}
     usual = flatten(type(config)())
     return {key: value for key, value in flatten(config).items() if value != usual[key]}
 

@@ -4,6 +4,8 @@ Each joint follows its velocity command through a first-order lag, discretised e
 
     q̇ = v,   v̇ = (u − v) / τ
 
+or, with `overshoot`, through one of second order: v̈ = ω² (u − v) − 2ζω v̇ with ω = 1/τ.
+
 Delay, noise, latency and lost frames are those of `servobench.plant.bench.bench`.
 """
 
@@ -23,7 +25,7 @@ from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
+from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
 from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
@@ -39,12 +41,19 @@ class KinematicConfig:
     """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
+    overshoot: ShareBelowOne = 0.0
+    """[1] of a step of the velocity: above 0 velocity loops swing at 1/τ, as stiff ones under unexpected loads do."""
     command_delay: NonNegative = 0.05
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     mechanics: MechanicsConfig = nested(MechanicsConfig)
     """Backlash and ripple of the gears, and a flexible tool."""
+
+    def __post_init__(self) -> None:
+        """Check across fields."""
+        if self.overshoot > 0.0 == self.lag:
+            raise ValueError("lag must be above 0 for velocity loops with overshoot, got 0")
 
 
 @lru_cache(maxsize=64)
@@ -64,6 +73,29 @@ def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
     return np.array([[1.0, lag * gone], [0.0, 1.0 - gone]]), np.array([period - lag * gone, gone])
 
 
+def follow_with_overshoot(
+    joints: tuple[FloatArray, FloatArray, FloatArray], u: FloatArray, config: KinematicConfig, period: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return q, v and v̇ after a period of v̈ = ω² (u − v) − 2ζω v̇ with a held command, in closed form.
+
+    Args:
+        joints: q, v, v̇, (..., n) each [rad, rad/s, rad/s²].
+        u: (..., n) [rad/s].
+        config: its lag is 1/ω; its overshoot, that of a step of u, is exp(−πζ / √(1 − ζ²)), above 0.
+        period: [s].
+    """
+    q, v, a = joints
+    omega, decrement = 1.0 / config.lag, -math.log(config.overshoot)
+    sigma = omega * decrement / math.hypot(math.pi, decrement)  # ζω
+    damped = math.sqrt(omega**2 - sigma**2)
+    cosine, sine = (math.exp(-sigma * period) * f(damped * period) for f in (math.cos, math.sin))
+    w = v - u
+    later = (cosine + sigma / damped * sine) * w + sine / damped * a
+    slope = (cosine - sigma / damped * sine) * a - omega**2 / damped * sine * w
+    way = period * u + (a - slope + 2.0 * sigma * (w - later)) / omega**2
+    return q + way, u + later, slope
+
+
 class KinematicState(NamedTuple):
     """The state of the world, whose arrays never change.
 
@@ -71,6 +103,7 @@ class KinematicState(NamedTuple):
         model: arm and camera as they are now.
         q: (..., n), rad.
         v: (..., n), rad/s.
+        a: (..., n), rad/s², of joints with overshoot; else 0.
         x: (..., n), rad, behind the gears.
         tool: of a flexible tool.
     """
@@ -78,6 +111,7 @@ class KinematicState(NamedTuple):
     model: RobotModel
     q: FloatArray
     v: FloatArray
+    a: FloatArray
     x: FloatArray
     tool: Tool
 
@@ -97,11 +131,12 @@ class KinematicWorld(World):
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
         rest, none = np.zeros(start.shape), np.zeros((*model.lead, 3))
         x = mechanics.transmitted(start) if mechanics.geared else start
-        self.lead, self._first = model.lead, KinematicState(model, start, rest, x, Tool(none, none))
-        self._model, self._q, self._v, self._x, self._tool = self._first
+        self.lead, self._first = model.lead, KinematicState(model, start, rest, rest, x, Tool(none, none))
+        self._model, self._q, self._v, self._a, self._x, self._tool = self._first
         self._flexible, self._parts = mechanics.tool_frequency > 0.0, mechanics.parts(setup.period)
         self._part = setup.period / self._parts
         mechanics.check(model)
+        self._config = config
         self._truth: Truth | None = None
         self._seen: BoolArray | None = None
         self.lag, self.noise_unit = config.lag, model.noise_unit
@@ -135,10 +170,16 @@ class KinematicWorld(World):
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
+        a = self._a
+        if self._config.overshoot > 0.0:
+            joints = self._q, self._v, self._a
+            q, v, a = follow_with_overshoot(joints, joint_velocity, self._config, self._part)
         if not is_finite(q):
             q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
         self._v = np.where(self._q == q, v, 0.0)
+        if self._config.overshoot > 0.0:
+            self._a = np.where(self._q == q, a, 0.0)
 
     def see(self) -> FloatArray:
         """Return the true feature."""
@@ -166,11 +207,11 @@ class KinematicWorld(World):
 
     def save(self) -> KinematicState:
         """See `Plant.save`."""
-        return KinematicState(self._model, self._q, self._v, self._x, self._tool)
+        return KinematicState(self._model, self._q, self._v, self._a, self._x, self._tool)
 
     def restore(self, state: KinematicState) -> None:
         """See `Plant.restore`."""
-        self._model, self._q, self._v, self._x, self._tool = state
+        self._model, self._q, self._v, self._a, self._x, self._tool = state
         self._truth, self.faults = None, {}
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple, final
 
 import numpy as np
@@ -37,6 +38,8 @@ class RbfnnConfig:
     """Predict with the known future of the reference; false: with its present value."""
     position: Literal["measured", "commanded"] = "measured"
     """The joint position q in ξ: as the encoders report it, or the sum of all commands as in the paper."""
+    offset_free: bool = False
+    """Subtract the trained command at rest instead of q: no error, no motion; not the paper's."""
     row_space_only: bool = True
     """Learn outside of the null space of Ĵ only; false as in the paper."""
     anti_windup: bool = True
@@ -72,8 +75,8 @@ class RbfnnLaw(Law[RbfnnState]):
 
     All of it counts in steps of s seconds, the step for which the network was trained, and not in control periods of dt
     seconds: k ± 1 is s later or earlier. An update of a control period has k' = 1 − (1 − k)^(dt / s), so that those of
-    s seconds remove the share k together (`update_share`). Command and learning per second therefore do not depend on
-    the control rate. The paper has s = dt.
+    s seconds remove the share k together, and at most k (`update_share`). Command and learning per second therefore do
+    not depend on the control rate. The paper has s = dt.
 
     e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (..., m) m; q joint position
     (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size;
@@ -83,6 +86,9 @@ class RbfnnLaw(Law[RbfnnState]):
     - ε, and the joint-speed limit in prediction and command.
     - "q(k−1)" is by default the measured position at instant k, from which the next step starts: the sum of all
       commands drifts away from the arm where a joint saturates or does not reach its commanded speed.
+    - A network fitted offline does not rest where e = 0: far outside of its region it asks for more than 1 rad/s there,
+      and the weights learn too little against small errors to cancel that. `offset_free` steps from the trained command
+      without errors instead of q, u = [ψ(ξ) ξ − ψ₀(0, q) (0, q)] / s; the trained posture of the arm is cancelled too.
     - The weights integrate Ĵᵀe. As the arm moves, Ĵ turns, and with n > m a part of the learned weights comes to lie in
       the null space of Ĵ, where no error can ever unlearn it: it drives the arm into ever new postures. With
       `row_space_only` the learned part W − W(0) is projected on the row space of Ĵ, which leaves Ĵ Δq as it was.
@@ -98,7 +104,7 @@ class RbfnnLaw(Law[RbfnnState]):
         Raises:
             ValueError: a network of other sizes than the plant, or a preview shorter than the horizon.
         """
-        spec, network = knowledge.spec, networks.controller
+        spec, network = knowledge.spec, replace(networks.controller, offset_free=config.offset_free)
         if (network.n, network.m) != (spec.n, spec.m):
             raise ValueError(
                 f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
@@ -203,11 +209,12 @@ def update_share(k: float, period: float, step: float) -> float:
         step: [s].
 
     Returns:
-        1 − (1 − k)^(period / step): as many updates as a step has periods remove k together. For k of 1 and more, which
-        removes more than all of the error, k period / step, and no more than k.
+        1 − (1 − k)^(period / step): as many updates as a step has periods remove k together; k period / step for k of 1
+        and more, which removes more than all of the error. No update removes more than k: its effect shows after the
+        loop's delay only, and where a period is longer than the step, updates that do not wait for it add up.
     """
     steps = in_periods(period, step)
-    return -math.expm1(steps * math.log1p(-k)) if k < 1.0 else min(k * steps, k)
+    return min(-math.expm1(steps * math.log1p(-k)) if k < 1.0 else k * steps, k)
 
 
 def _places(count: int, rate: float) -> FloatArray:

@@ -29,7 +29,7 @@ class RollOut(NamedTuple):
         errors: e(k+1) … e(k+T), (..., T, m), m.
         xi: ξ(k) … ξ(k+T−1), (..., T, p).
         h: h(k) … h(k+T−1), (..., T, N_h).
-        wanted: ψ(ξ) ξ − q(k−1), (..., n), rad, the first joint step before it is limited.
+        wanted: ψ(ξ) ξ less `ControllerNetwork.origin`, (..., n), rad, the first joint step before it is limited.
     """
 
     errors: FloatArray
@@ -62,7 +62,6 @@ def roll_out(
     *lead, horizon, m = reference_steps.shape
     n, p, hidden = weights.shape[-3:]
     lengths = history[0].shape[-2], history[1].shape[-2]
-    newest = m * lengths[0]  # q(k−1) begins here in ξ
     A = np.broadcast_to(_shift(m, n, *lengths), (*lead, p, p + n + m)).copy()
     A[..., :m, p : p + n] = -jacobian
     states, hs = np.empty((*lead, horizon + 1, p + n + m)), np.empty((*lead, horizon, hidden))
@@ -72,7 +71,7 @@ def roll_out(
     for t in range(horizon):
         state, xi = states[..., t, :], xis[..., t, :]
         h = hs[..., t, :] = network.features(xi)
-        dq = controller_output(weights, xi, h) - xi[..., newest : newest + n]
+        dq = controller_output(weights, xi, h) - network.origin(xi)
         if t == 0:
             wanted = dq
         excess = np.maximum.reduce(np.abs(dq) * reach, axis=-1, keepdims=True, initial=1.0)

@@ -52,6 +52,8 @@ class ControllerTraining:
     """[s] s, step of the network's commands, at any control period; the paper's is the control period."""
     gain: Positive = 3.0
     """[1/s] K_p of the law that is imitated."""
+    damping: NonNegative = 0.0
+    """[m/rad] δ of the imitated law's inverse; 0: J⁺ without directions below a tenth of the strongest."""
     posture_gain: NonNegative = 0.5
     """[1/s] K_n, towards the region's middle in the null space; 0 as in the paper."""
     fit: Literal["output", "entries"] = "output"

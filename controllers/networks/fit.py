@@ -10,7 +10,9 @@ Controller network, one of two fits by ridge least squares on samples of ξ:
 
 The paper's ideal law leaves the null space of J alone, so an arm with n > m wanders out of the region on which it was
 trained. The output fit therefore imitates ψ ξ ≈ q + K_p s J⁺ e + K_n s (I − J⁺J)(q_c − q), which draws the posture
-towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law.
+towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law. J⁺ leaves out directions in
+which the feature is weak, such as the depth of a narrow stereo pair; with `damping` δ it is Jᵀ(JJᵀ + δ²I)⁻¹ and holds
+them, which is not the paper's.
 
 Widths and regularisation are the best of a small grid on held-out samples. Nothing here is random beyond the
 configuration's own seed.
@@ -26,6 +28,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, Placement, TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
@@ -93,7 +96,7 @@ class ControllerSamples:
         xi: ξ, (S, p), m and rad.
         error: e(k), (S, m), m.
         position: q(k−1), (S, n), rad.
-        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m; without the directions in which the joints hardly move the feature.
+        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m; with little in directions in which joints hardly move the feature.
         posture_step: K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
     """
 
@@ -139,7 +142,9 @@ def controller_samples(
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
     positions = q[:, None, :] - back[:, : plan.position_history]
-    pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
+    pinv = damped_inverse(J, plan.damping)
+    if plan.damping == 0.0:
+        pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant

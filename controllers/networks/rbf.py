@@ -220,6 +220,7 @@ class ControllerNetwork:
         position_history: L_c, how many joint positions ξ holds.
         kernel: of the hidden layer, see `hidden_features`.
         step: between the instants of ξ, and from q to the position ψ ξ [s].
+        offset_free: whether `origin` is the trained network's own command at rest.
     """
 
     centres: FloatArray
@@ -229,6 +230,7 @@ class ControllerNetwork:
     position_history: int
     kernel: Kernel = "exponential"
     step: float = STEP
+    offset_free: bool = False
 
     def __post_init__(self) -> None:
         """Check that arrays and sizes fit together and freeze the arrays."""
@@ -272,6 +274,13 @@ class ControllerNetwork:
     def command(self, xi: FloatArray) -> FloatArray:
         """Return q_cmd = ψ(ξ) ξ, (..., n), rad, with the weights as they were trained."""
         return controller_output(self.weights, xi, self.features(xi))
+
+    def origin(self, xi: FloatArray) -> FloatArray:
+        """Return from where the joints step to ψ ξ, (..., n), rad: q(k−1), or the trained command without errors."""
+        newest = self.m * self.error_history
+        if not self.offset_free:
+            return xi[..., newest : newest + self.n]
+        return self.command(xi * (np.arange(xi.shape[-1]) >= newest))
 
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "First steps": (runs.run, runs.compare, results.statistics, results.report, record),
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
-    "Studies": (studies.sweep, analyse, studies.robustness, studies.claims, studies.tune),
+    "Studies": (studies.sweep, analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
     "Tools": (runs.train, results.collect, results.export, results.verify),
 }
 

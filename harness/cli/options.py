@@ -40,8 +40,9 @@ class Value(NamedTuple):
         return Value(f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None)
 
 
-PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH = (
-    Value("NAME", selection.completing(kind)) for kind in ("plants", "controllers", "estimators", "tasks", "mismatch")
+PLANT, CONTROLLER, ESTIMATOR, TASK, MISMATCH, CHALLENGE = (
+    Value("NAME", selection.completing(kind))
+    for kind in ("plants", "controllers", "estimators", "tasks", "mismatch", "challenges")
 )
 ROBOT, SENSING = (
     Value("NAME", selection.completing(kind), partial(selection.choose, kind)) for kind in ("robot", "sensing")
@@ -123,6 +124,7 @@ RobotOption = Annotated[
         ROBOT_WORDS,
         absent={
             "claims": "the claims are those of the paper, which are about a UR5",
+            "suite": "challenges are graded on the UR5; compare and sweep take other arms",
             "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
         },
     ),
@@ -135,6 +137,7 @@ SensingOption = Annotated[
         "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
         absent={
             "claims": "the claims are those of the paper, which are about the ball in 3-D",
+            "suite": "challenges are graded on the ball in 3-D; compare and sweep take other sensing",
             "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
             "compare shows how they do",
             "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",

@@ -35,7 +35,7 @@ class Names(NamedTuple):
 
 @cache
 def names_of(kind: str) -> Names:
-    """Return the names of a kind: plants, controllers, estimators, tasks, mismatch, robot or sensing."""
+    """Return the names of a kind: plants, controllers, estimators, tasks, challenges and so on."""
     return KINDS[kind]()  # which imports no more than its kind needs, as shells wait for completions
 
 
@@ -97,9 +97,19 @@ def _sensings() -> Names:
     return Names(sensing_names, find_sensing)
 
 
+def _challenges() -> Names:
+    from servobench.harness.studies.challenge import challenge_names, find_challenge
+
+    def find(word: str) -> None:
+        find_challenge(word)
+
+    return Names(challenge_names, find)
+
+
 KINDS: Final[dict[str, Callable[[], Names]]] = {
     "plants": _plants, "controllers": _controllers, "estimators": _estimators, "tasks": _tasks,
     "mismatch": _mismatches, "robot": _robots, "sensing": _sensings,
+    "challenges": _challenges,
 }  # fmt: skip
 
 

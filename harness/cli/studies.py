@@ -1,4 +1,4 @@
-"""The commands `servobench sweep | robustness | claims | tune`: studies of many runs."""
+"""The commands `servobench sweep | robustness | suite | claims | tune`: studies of many runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, PLANT, named_option, option
+from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
 from servobench.harness.cli.results import judge
 from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
@@ -91,6 +91,46 @@ def robustness(
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")
+
+
+def suite(
+    *,
+    out: options.FolderOption,
+    challenges: Annotated[
+        str, option(CHALLENGE.several(), "Comma-separated names, or .toml files of your own; default: all names.")
+    ] = selection.ALL,
+    grade: Annotated[
+        str, option("NAMES", "Comma-separated grades, I, II or III, of the challenges; default: all.")
+    ] = "",
+    controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
+    plants: Annotated[
+        str, option(PLANT.several(), "Comma-separated names or files; default: those of each file.")
+    ] = "",
+    seeds: options.SeedsOption = "40",
+    reference_seeds: Annotated[
+        int | None, option("COUNT", "Robots on which references run and scores are given; default: all.", min=1)
+    ] = None,
+    running: options.Running,
+    overrides: options.Overrides,
+) -> None:
+    """Score methods over challenges, worlds that tell them apart.
+
+    A score is the error or time of a method that knows the true robot over that of the method; a lost run has 0.
+    """
+    from servobench.harness.batch.plan import parse_seeds
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.studies.challenge import choose_challenges
+    from servobench.harness.studies.suite import carry_out_suite, suite_tables
+
+    worlds = choose_challenges(selection.split("challenges", challenges), selection.split_words(grade))
+    names = selection.split("controllers", controllers)
+    where = selection.split("plants", plants) if plants else ()
+    robots = parse_seeds(seeds)
+    runs = {world.name: world.cells(where, names, robots, reference_seeds) for world in worlds}
+    with watching(console, out, running.execution()) as how:
+        judged = carry_out_suite(out, worlds, runs, overrides.settings(), how)
+    print_tables(suite_tables(judged), "score: reference over method, at most 1; 0 for a lost run")
+    say(f"tables and pictures in {out}; the runs of each challenge in a folder of its name")
 
 
 def claims(
@@ -262,3 +302,6 @@ def _print_tuned(results: Mapping[str, TunedValues]) -> None:
         spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
         rows.append((name, *(f"{number:.4f}" for number in numbers), spread))
     print_rows(("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies"), rows)
+    for name, tuned in results.items():
+        for edge in tuned.edges:
+            say(f"{name}: {edge}; with these values in use the next study searches a wider box")

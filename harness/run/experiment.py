@@ -349,7 +349,7 @@ def _build_controller(
                 nominal_jacobian=nominal,
                 true_jacobian=true.jacobian,
                 true_symbolic=true.symbolic,
-                true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0),
+                true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread),
             )
         return entry.build(config, knowledge)
     except ValueError as error:

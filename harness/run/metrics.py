@@ -23,6 +23,7 @@ from servobench.plant.contract.lanes import norm, transposed
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
+ERROR_FLOOR = 0.3  # of the settling band; a smaller error counts as none in `log_error`
 LARGE_COMMAND = 0.1  # share of the joint's speed limit from which on a command counts as large
 SWITCH_PERIODS = 2  # within which a change of sign counts as a switch
 
@@ -129,7 +130,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
 
 
 def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> FloatArray:
-    """Return the first time after which `error` stays within `band`.
+    """Return the time from which on `error` stays within `band`, interpolated linearly between two periods.
 
     Args:
         error: (..., k), one value a period [unit of the feature].
@@ -139,10 +140,20 @@ def settling_time(error: FloatArray, band: npt.ArrayLike, period: float) -> Floa
     Returns:
         (...) [s]; NaN if the error is outside at the end, or came in less than `DWELL` before it.
     """
-    count = error.shape[-1]
-    outside = ~(error <= np.asarray(band)[..., None])
+    count, band = error.shape[-1], np.asarray(band)
+    outside = ~(error <= band[..., None])
     first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
-    return np.where((count - first) * period >= DWELL - 1e-9, first * period, np.nan)
+    settled = (count - first) * period >= DWELL - 1e-9
+    row = np.where(settled, first, 0)[..., None]
+    before, after = (np.take_along_axis(error, rows, axis=-1)[..., 0] for rows in (np.maximum(row - 1, 0), row))
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the first row is inside, or no row stays inside
+        crossing = first - np.where(first > 0, (band - after) / (before - after), 0.0)
+    return np.where(settled, crossing * period, np.nan)
+
+
+def log_error(error: FloatArray, band: float) -> FloatArray:
+    """Return the mean over periods, (...), of log₁₀(e / 0.3 band), at least 0, of an error (..., k) [as the band]."""
+    return np.asarray(np.log10(np.maximum(error / (ERROR_FLOOR * band), 1.0)).mean(axis=-1))
 
 
 def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
@@ -236,8 +247,8 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
 _ALL: Final = (
     Metric(
         "settling_time_s", "s", "settling time", 2,
-        "k·dt of the first row from which on e stays ≤ `settling_band` to the end; NaN if the last row is outside, or "
-        "the error came in less than 0.5 s before the end",
+        "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
+        "is outside, or the error came in less than 0.5 s before the end",
         lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
         tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary("after", 2, "point_to_point"),
     ),
@@ -279,6 +290,11 @@ _ALL: Final = (
         "root of the mean of e² over the judged part of the [task](plants.md#tasks); NaN if the run ended before it",
         lambda run: _rms(run, run.evaluated),
         tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary("RMS end", 1),
+    ),
+    Metric(
+        "log_error", "1", "mean logarithmic error", 2,
+        "mean over all rows of log₁₀(e / 0.3 `settling_band`), at least 0; a measure for tuning",
+        lambda run: log_error(run.error, run.steps.spec.feature.band),
     ),
     Metric(
         "path_length_ratio", "1", "path ratio", 3,

@@ -273,7 +273,8 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        return replace(model, latency=self._sensing.latency, command_delay=self._command_delay, lag=self.world.lag)
+        sensing, delay, lag = self._sensing, self._command_delay, self.world.lag
+        return replace(model, latency=sensing.latency, command_delay=delay, lag=lag, latency_spread=sensing.jitter)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""

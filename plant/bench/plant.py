@@ -38,6 +38,7 @@ class TrueModel:
         latency: between exposure and delivery of a frame, s.
         command_delay: between a command and its first effect, s.
         lag: time constant of the joints' velocity loops, s; None where it is unknown.
+        latency_spread: by which a frame may be later than the latency, s.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
@@ -45,6 +46,7 @@ class TrueModel:
     latency: float = 0.0
     command_delay: float = 0.0
     lag: float | None = None
+    latency_spread: float = 0.0
 
 
 class Abilities(ABC):

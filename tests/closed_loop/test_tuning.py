@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,13 @@ from servobench.controllers.aids import EQUIPPED
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import controller_names, find_controller
-from servobench.harness.config.settings import apply_settings, default_config, flatten
+from servobench.harness.config.settings import apply_settings, default_config, flatten, tuned_settings
+from servobench.harness.run.metrics import log_error, settling_time
 from servobench.harness.studies.tuning.campaign import TOLERANCE, Change, Check, improvements
 from servobench.harness.studies.tuning.objective import (
-    CONDITIONS,
+    KINDS,
+    LEVELS,
+    MODELS,
     MOVE,
     WEIGHTS,
     Trial,
@@ -32,11 +37,13 @@ from servobench.harness.studies.tuning.search import first_points, inside
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
+    edges,
     find_space,
     find_tunable,
     is_switch,
     nested_settings,
     values_of,
+    widened,
 )
 
 CORNERS = 64
@@ -83,6 +90,31 @@ def test_every_corner_of_the_numbers_can_be_built_and_keeps_to_the_preview(name)
         flat = flatten(apply_settings(find_tunable(name), settings))
         assert flat.get("law.horizon_time", 0.0) <= 0.5
         assert all(value >= 1 for key, value in flat.items() if key.endswith("horizon"))
+
+
+def test_a_number_at_an_edge_is_found_and_its_box_widened_up_to_what_is_no_choice():
+    space = {
+        "gain": FloatDistribution(1.0, 100.0, log=True),
+        "share": FloatDistribution(0.0, 1.0),
+        "law.k": FloatDistribution(0.01, 1.0, log=True),
+        "steps": FloatDistribution(2.0, 5.0, step=1.0),
+        "word": CategoricalDistribution(("a", "b")),
+    }
+    inside = {"gain": 10.0, "share": 0.0, "law.k": 0.1, "steps": 3.0, "word": "a"}  # a lower end of 0 is no choice
+    assert edges(space, inside) == {}
+    assert dict(widened(space, inside)) == space
+    at_ends = {"gain": 1.1, "share": 0.97, "law.k": 0.95, "steps": 5.0}
+    assert edges(space, at_ends) == {"gain": "lower", "share": "upper", "law.k": "upper", "steps": "upper"}
+    wider = widened(space, at_ends)
+    assert [(wider[key].low, wider[key].high) for key in at_ends] == [(0.25, 100), (0, 2), (0.01, 1.9), (2, 8)]
+    assert edges(wider, at_ends) == {}
+    beyond = widened(space, {"gain": 150.0})["gain"]
+    assert (beyond.low, beyond.high) == (1.0, 600.0)
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_values_in_use_lie_inside_of_their_widened_boxes(name):
+    assert edges(find_space(name), flatten(tuned_settings(name))) == {}
 
 
 def test_settings_are_nested_and_rounded_to_three_digits():
@@ -134,47 +166,95 @@ def test_tuned_files_do_not_matter_to_a_trial():
     assert default_config(find_tunable("rls:published")) != find_tunable("rls:published").config()
 
 
-def test_every_run_has_a_robot_of_its_own_and_every_condition_plain_and_turned_cameras():
-    runs = TuningSet(robots=4, offset=100).runs()
+def test_every_run_has_a_robot_of_its_own_and_every_model_and_level_occurs_equally_often():
+    chosen = TuningSet(robots=4, offset=100)
+    runs, worlds = chosen.runs(), chosen.runs()[::4]
     assert [run.seed for run in runs] == list(range(TUNING.start + 100, TUNING.start + 100 + len(runs)))
-    for index in range(len(CONDITIONS)):
-        of_condition = runs[4 * index : 4 * index + 4]
-        turned = [run.mismatch.size("camera_rotation") for run in of_condition]
-        assert turned[0] == turned[2] < turned[3] < turned[1]
-        assert len({(run.task, run.varied) for run in of_condition}) == 1
+    models = Counter(next(model for model in reversed(MODELS) if str(run.mismatch).startswith(model)) for run in runs)
+    assert models == dict.fromkeys(MODELS, 4)
+    assert Counter(dict(run.varied)["plant.sensing.latency"] for run in worlds) == dict.fromkeys(LEVELS["latency"], 2)
+    assert Counter(dict(run.varied)["plant.sensing.noise_factor"] for run in worlds) == {1.0: 4, 4.0: 4}
+    assert {dict(run.varied).get("run.period", 0.05) for run in worlds} == {0.2, 0.1, 0.05, 0.008}
+    for detector in filter(None, LEVELS["detector"]):
+        assert [str(run.mismatch).endswith(detector) for run in worlds].count(True) == 1
+    for world in range(len(KINDS)):
+        assert len({(run.task, run.varied) for run in runs[4 * world : 4 * world + 4]}) == 1
+
+
+def test_the_worlds_are_drawn_by_the_seed_of_the_set_and_are_others_in_the_second():
+    assert TuningSet().runs() == TuningSet().runs()
+    sets = TuningSet(), TuningSet().second(), TuningSet(offset=32)
+    drawn = [[(run.task, run.varied) for run in each.runs()[:: each.robots]] for each in sets]
+    assert drawn[0] != drawn[1] != drawn[2] != drawn[0]
+
+
+def test_plants_share_robots_and_only_one_whose_drives_can_overshoot_has_overshoot():
     twice = TuningSet(("kinematic", "bullet"), 2).runs()
-    assert [run.plant for run in twice] == ["kinematic"] * 14 + ["bullet"] * 14
-    assert twice[0].seed == twice[14].seed
+    here, there = twice[:16], twice[16:]
+    assert ({run.plant for run in here}, {run.plant for run in there}) == ({"kinematic"}, {"bullet"})
+    assert [run.seed for run in here] == [run.seed for run in there]
+    keys = [[key for run in runs for key, _ in run.varied] for runs in (here, there)]
+    assert [each.count("plant.overshoot") for each in keys] == [2, 0]
+    assert [each.count("plant.command_delay") for each in keys] == [2, 2]
 
 
-def test_on_one_circle_commands_take_effect_at_once_and_on_the_others_with_the_delay_of_the_plant():
-    entry = find_tunable("constant")
-    circles = [run for run in SMALL.runs() if run.task == "circle"]
-    plants = [run.plant for run in Trial("constant", default_config(entry)).resolved(circles)]
-    assert [(plant.command_delay, plant.sensing.latency) for plant in plants] == [(0.05, 0.0)] * 2 + [(0.0, 0.05)] * 2
+def test_the_worlds_reach_the_plant_the_rate_and_the_task():
+    runs = Trial("constant", default_config(find_tunable("constant"))).resolved(SMALL.runs())
+    assert {run.plant.overshoot for run in runs} == {0.0, 0.3}
+    assert {run.plant.command_delay for run in runs} == {0.0, 0.05}
+    assert {run.plant.sensing.outliers for run in runs} == {0.0, 0.05, 0.2}
+    assert {run.run.period for run in runs} == {0.2, 0.1, 0.05, 0.008}
+    moves = [run.task for run in runs if run.request.task == MOVE]
+    assert {task.duration for task in moves} == {6.0, 2.0}
+    assert {round(task.upper[0] - task.lower[0], 6) for task in moves} == {1.1, 2.1}
 
 
 @pytest.mark.parametrize(
     ("task", "row", "cost"),
     [
-        (MOVE, {"settling_time_s": 1.5, "rms_error_evaluated": 0.001}, 0.25),
-        (MOVE, {"settling_time_s": np.nan, "rms_error_evaluated": 0.05}, 1.5),
-        (MOVE, {"settling_time_s": 1.0, "rms_error_evaluated": 0.001, "status": "plant_diverged"}, 2.0),
-        ("circle", {"rms_error_evaluated": 0.0125}, 0.4),
-        ("lemniscate", {"rms_error_evaluated": 0.15}, 1.5),
-        ("circle", {"rms_error_evaluated": np.nan, "status": "solver_failed"}, 2.0),
+        (MOVE, {"log_error": 0.0}, 0.0),
+        (MOVE, {"log_error": np.log10(1.0 / 0.0015) / 4.0}, 0.25),
+        (MOVE, {"log_error": 5.0}, 1.0),
+        (MOVE, {"log_error": 0.1, "status": "plant_diverged"}, 1.0),
+        ("circle", {"rms_error_evaluated": 0.001}, 0.0),
+        ("lemniscate", {"rms_error_evaluated": np.sqrt(0.0015)}, 0.5),
+        ("circle", {"rms_error_evaluated": np.nan, "status": "solver_failed"}, 1.0),
     ],
 )
 def test_the_cost_of_a_run_computed_by_hand(task, row, cost):
-    row = {"settling_time_s": np.nan, "status": "completed"} | row
+    row = {"log_error": np.nan, "status": "completed"} | row
     assert run_cost(task, row) == pytest.approx(WEIGHTS[task] * cost)
+    assert np.mean([WEIGHTS[each] for each, _ in KINDS]) == pytest.approx(1.0)
+
+
+def test_the_cost_of_a_move_is_continuous_where_settling_is_not_and_orders_runs_by_speed_and_rest():
+    """An approach exp(−t/τ), a rest, and an error that comes back for a tenth of a second before the end."""
+    times = np.arange(0.0, 6.0, 0.05)
+
+    def judged(rate=0.2, rest=0.0005, late=0.0):
+        error = np.maximum(0.3 * np.exp(-times / rate), rest)
+        error[-3:-1] = np.maximum(error[-3:-1], late)
+        row = {"status": "completed", "log_error": log_error(error, 0.005)}
+        return run_cost(MOVE, row), settling_time(error, 0.005, 0.05)
+
+    sizes = np.linspace(0.0, 0.02, 401)
+    costs, settled = np.array([judged(late=late) for late in sizes]).T
+    assert np.isnan(settled).any()  # the error leaves the band
+    assert not np.isnan(settled).all()
+    assert (np.diff(costs) >= 0.0).all()
+    assert np.diff(costs).max() < 5e-4 * costs[0] / 0.05
+    rates, rests = np.linspace(0.1, 1.0, 50), np.linspace(0.002, 0.3, 50)
+    assert (np.diff([judged(rate=rate)[0] for rate in rates]) > 0.0).all()
+    assert (np.diff([judged(rest=rest)[0] for rest in rests]) > 0.0).all()
+    slow, fast = judged(rate=0.4)[0], judged(rate=0.2)[0]
+    assert slow == pytest.approx(2.0 * fast, rel=0.1)  # it grows in proportion to the settling time
 
 
 def test_a_better_tuned_controller_has_the_better_score():
     """Resolved-rate control by the true Jacobian: with feedforward it follows the circle, without it lags behind."""
     entry = find_tunable("calibrated")
     trials = [Trial("calibrated", apply_settings(entry, {"aids": {"feedforward": switch}})) for switch in (True, False)]
-    runs = [run for run in SMALL.runs() if run.task == "circle"]
+    runs = [replace(run, mismatch="moderate") for run in SMALL.runs() if run.task == "circle"]
     costs = np.zeros((2, len(runs)))
     for trial, run, cost in evaluate(trials, runs, Workers()):
         costs[trial, run] = cost

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import casadi
 import numpy as np
@@ -6,10 +7,10 @@ import pytest
 
 from kit.plants import nominal_ur5
 from kit.toy import plant_spec
-from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
+from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig, exposure_ages
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.faults import SolverFailed
@@ -103,14 +104,63 @@ def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
     assert controller.diagnostics()["fallbacks"] == 0
 
 
-def test_a_disturbance_of_the_camera_is_followed_only_with_a_gain():
+def commands(target, *, offset=(0.0, 0.0, 0.0), latency=0.0, disturb=None, periods=60, **changes):
+    """Return the commands of a loop of ideal joints and, at its end, the error of the feature at the target."""
+    known = replace(knowledge(), true_delays=Delays(latency, 0.0, 0.0, changes.pop("spread", 0.0)))
+    controller = NmpcCalibrated(NmpcCalibratedConfig(delay=0.0, **changes), known)
+    joints, found = [START], []
+    for k in range(periods):
+        age = round(latency / 0.05) if disturb is None else disturb(k)
+        measured = MODEL.feature(joints[max(0, k - age)] if isinstance(age, int) else joints[k] + age) + offset
+        observation = Observation(0.05 * k, joints[k], measured)
+        found.append(controller.step(observation, hold(target)).joint_velocity)
+        joints.append(joints[k] + 0.05 * found[k])
+    return np.array(found), np.linalg.norm(MODEL.feature(joints[-1]) + offset - target)
+
+
+TARGET = MODEL.feature(START) + [0.1, -0.05, 0.05]
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.1])
+def test_without_disturbance_the_image_changes_no_command(latency):
+    alone, _ = commands(TARGET, latency=latency)
+    fed_back, error = commands(TARGET, latency=latency, image=True)
+    np.testing.assert_allclose(fed_back, alone, atol=1e-9)
+    assert error < 1e-6
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.1])
+def test_a_constant_offset_of_the_image_is_removed_by_the_image_only(latency):
+    offset = np.array([0.03, -0.02, 0.01])
+    assert commands(TARGET, offset=offset, latency=latency)[1] > 0.03
+    assert commands(TARGET, offset=offset, latency=latency, image=True)[1] < 1e-6
+
+
+def test_a_fifth_of_the_frames_may_be_outliers():
+    def outlier(k):
+        return np.full(6, 0.3) if k % 5 == 0 else np.zeros(6)
+
+    alone, _ = commands(TARGET)
+    fed_back, error = commands(TARGET, disturb=outlier, image=True)
+    np.testing.assert_allclose(fed_back, alone, atol=1e-9)
+    assert error < 1e-6
+
+
+def test_frames_that_are_late_by_unknown_times_within_known_bounds_disturb_no_motion():
+    alone, _ = commands(TARGET)
+    fed_back, _ = commands(TARGET, disturb=lambda k: k * k % 3, image=True, spread=0.1)
+    np.testing.assert_allclose(fed_back, alone, atol=1e-9)
+    unaware, _ = commands(TARGET, disturb=lambda k: k * k % 3, image=True)
+    assert np.abs(unaware - alone).max() > 1e-3
+    np.testing.assert_allclose(exposure_ages(Delays(0.1, 0.0, 0.0, 0.05), 0.05), 2.0 + 0.25 * np.arange(8))
+
+
+def test_a_lost_frame_leaves_the_offset_as_it_is():
     y = MODEL.feature(START)
-    shifted = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]))
-    for gain, moves in ((0.0, False), (40.0, True)):
-        command = make(disturbance_rate=gain).step(shifted, hold(y))
-        assert (np.abs(command.joint_velocity).max() > 1e-3) == moves
+    controller = make(image=True)
     lost = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]), feature_valid=False)
-    assert np.abs(make(disturbance_rate=40.0).step(lost, hold(y)).joint_velocity).max() < 1e-6
+    for _ in range(20):
+        assert np.abs(controller.step(lost, hold(y)).joint_velocity).max() < 1e-6
 
 
 def infeasible(fallback):

@@ -51,14 +51,19 @@ def case(net, seed=1, horizon=4, limit=1e6):
 
 @pytest.mark.parametrize(("error_history", "position_history"), [(1, 1), (2, 2), (3, 1), (1, 3)])
 @pytest.mark.parametrize("limit", [1e6, 0.02])
-def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit):
+@pytest.mark.parametrize("offset_free", [False, True])
+def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit, offset_free):
     net = network(error_history=error_history, position_history=position_history)
+    net = replace(net, offset_free=offset_free)
     J, (errors, positions), steps, ahead = case(net, limit=limit)
     e_list, q_list, wanted = list(errors), list(positions), []
     for t in range(4):
         xi = np.concatenate([*e_list[:error_history], *q_list[:position_history]])
         h = np.exp(-np.linalg.norm(xi - net.centres, axis=1) / net.widths**2)
-        wanted.append(sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi))) - q_list[0])
+        rest = np.concatenate([np.zeros(net.m * error_history), *q_list[:position_history]])
+        h_rest = np.exp(-np.linalg.norm(rest - net.centres, axis=1) / net.widths**2)
+        origin = sum(net.weights[:, j] @ h_rest * rest[j] for j in range(len(xi))) if offset_free else q_list[0]
+        wanted.append(sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi))) - origin)
         dq = scale_to_limit(wanted[t], np.full(net.n, limit))
         e_list, q_list = [e_list[0] + steps[t] - J @ dq, *e_list], [q_list[0] + dq, *q_list]
         np.testing.assert_allclose(ahead.errors[t], e_list[0], atol=1e-12)
@@ -113,6 +118,15 @@ def test_the_first_step_equals_the_one_computed_by_hand():
         Estimate(np.array([[1.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
     )
     np.testing.assert_allclose(u, [0.3 / PERIOD], rtol=1e-12)
+
+
+@pytest.mark.parametrize("far", [1.0, 30.0])
+def test_without_an_error_the_offset_free_law_rests_also_far_from_where_its_network_was_trained(far):
+    q, y = np.full(3, far), np.array([0.3, -0.2])
+    observation, reference = seen(q, y), np.tile(y, (PREVIEW + 1, 1))
+    printed, ours = (law(network(), offset_free=free).command(ONES, observation, reference) for free in (False, True))
+    assert np.abs(printed).max() > 0.1
+    np.testing.assert_array_equal(ours, np.zeros(3))
 
 
 def null_motion(row_space_only):
@@ -241,7 +255,7 @@ def at_rate(rate, net, **config):
 def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
     assert update_share(0.1, 0.05, 0.05) == 0.1
     assert (1.0 - update_share(0.4, 0.01, 0.05)) ** 5 == pytest.approx(1.0 - 0.4)
-    assert update_share(0.4, 0.1, 0.05) == pytest.approx(1.0 - 0.6 * 0.6)
+    assert update_share(0.4, 0.2, 0.05) == 0.4  # an update acts after the delay only, so that no more can be removed
     assert update_share(1.7, 0.01, 0.05) == pytest.approx(0.34)
     assert update_share(1.7, 1.0, 0.05) == 1.7
 

@@ -23,7 +23,7 @@ from servobench.plant.contract.faults import ConfigurationError
 SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")
 CONTINUED = re.compile(r"\s*\\\n\s+")
-BATCHES = ("run", "compare", "sweep", "robustness", "claims")  # carried out up to the first worker
+BATCHES = ("run", "compare", "sweep", "robustness", "suite", "claims")  # carried out up to the first worker
 QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  # carried out whole
 ONLY_READ = {
     "fmu": "compiles a model, which test_robot_commands.py does",
@@ -38,7 +38,16 @@ ONLY_READ = {
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
-OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate", "learned")  # yours
+OWN = (
+    "my_ur10e.yaml",
+    "my_world.toml",
+    "my_arm.urdf",
+    "mine.toml",
+    "crane.toml",
+    "planar",
+    "nominal_rate",
+    "learned",
+)  # yours
 
 
 def shown_lines():

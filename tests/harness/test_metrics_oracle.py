@@ -47,10 +47,15 @@ def distance(a, b):
 
 
 def settled(error, band):
-    """The first time from which on all errors are within the band, half a second before the end at the latest."""
+    """The time from which on all errors are within the band, half a second before the end at the latest."""
     for first in range(len(error)):
         if all(value <= band for value in error[first:]):
-            return first * PERIOD if (len(error) - first) * PERIOD >= 0.5 - 1e-9 else math.nan
+            if (len(error) - first) * PERIOD < 0.5 - 1e-9:
+                return math.nan
+            if first == 0:
+                return 0.0
+            slope = (error[first] - error[first - 1]) / PERIOD
+            return (first - 1) * PERIOD + (band - error[first - 1]) / slope
     return math.nan
 
 
@@ -93,6 +98,7 @@ def by_definition(steps, kind):
         "max_error": max(error),
         "rms_error_second_lap": rms([e for e, t in zip(error, times, strict=True) if LAP <= t < 2 * LAP]),
         "rms_error_evaluated": rms([e for e, t in zip(error, times, strict=True) if t >= EVALUATED - 1e-9]),
+        "log_error": sum(max(0.0, math.log10(e / (0.3 * BAND * SPEC.feature.scale))) for e in error) / len(error),
         "path_length_ratio": sum(map(distance, y, y[1:])) / way if way else math.nan,
         "max_joint_position_rad": max(abs(q) for row in steps.joint_position.tolist() for q in row),
         "control_effort_rad": sum(flat[0]) * PERIOD,

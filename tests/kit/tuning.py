@@ -58,4 +58,5 @@ def read_tuned(path):
     """Return the contents of a file of tuned values."""
     data = tomllib.loads(path.read_text(encoding="utf-8"))
     studies = tuple(StudyRecord(**record) for record in data["studies"])
-    return TunedValues(**{**data, "plants": tuple(data["plants"]), "studies": studies})
+    lists = {key: tuple(data[key]) for key in ("plants", "edges") if key in data}
+    return TunedValues(**{**data, **lists, "studies": studies})

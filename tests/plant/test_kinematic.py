@@ -4,12 +4,13 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from kit.plants import configure, nominal_ur5
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.signals import Command
-from servobench.plant.kinematic import KinematicConfig, build_kinematic, discretise_lag
+from servobench.plant.kinematic import KinematicConfig, build_kinematic, discretise_lag, follow_with_overshoot
 from servobench.plant.robot.ur5 import HOME
 
 START = np.array(HOME)
@@ -34,8 +35,27 @@ def test_the_lag_is_discretised_exactly(lag):
     np.testing.assert_allclose(B, discrete.B[:, 0], atol=1e-14)
 
 
-def test_two_half_periods_are_one_period():
-    whole, half = make(0.1, **QUIET), make(0.05, **QUIET)
+@pytest.mark.parametrize("overshoot", [0.05, 0.6])
+def test_joints_with_overshoot_follow_the_second_order_system_and_pass_a_step_by_it(overshoot):
+    config = configure(KinematicConfig, lag=0.04, overshoot=overshoot)
+    zeta = -np.log(overshoot) / np.hypot(np.pi, np.log(overshoot))
+    rate = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, -625.0, -50.0 * zeta, 625.0], [0, 0, 0, 0]])
+    start = np.array([0.3, -0.2, 1.5, 0.7])  # q, v, a, u
+    expected = expm(0.05 * rate) @ start
+    found = follow_with_overshoot(tuple(start[:3, None]), start[3:], config, 0.05)
+    np.testing.assert_allclose(np.concatenate(found), expected[:3], atol=1e-14)
+    step = [follow_with_overshoot((np.zeros(1),) * 3, np.ones(1), config, t)[1][0] for t in np.arange(1, 400) * 0.001]
+    assert max(step) == pytest.approx(1.0 + overshoot, abs=1e-3)
+
+
+def test_overshoot_needs_a_lag():
+    with pytest.raises(ValueError, match="lag must be above 0 for velocity loops with overshoot, got 0"):
+        configure(KinematicConfig, lag=0.0, overshoot=0.1)
+
+
+@pytest.mark.parametrize("overshoot", [0.0, 0.3])
+def test_two_half_periods_are_one_period(overshoot):
+    whole, half = make(0.1, overshoot=overshoot, **QUIET), make(0.05, overshoot=overshoot, **QUIET)
     command = Command(np.linspace(-0.4, 0.4, 6))
     whole.step(command)
     half.step(command)

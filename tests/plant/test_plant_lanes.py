@@ -33,7 +33,13 @@ DISTURBED = {
 
 
 @pytest.fixture(
-    params=[("kinematic", WORST), ("fmu", WORST), ("kinematic", FINE), ("fmu", FINE), ("kinematic", DISTURBED)]
+    params=[
+        ("kinematic", WORST),
+        ("fmu", WORST),
+        ("kinematic", FINE | {"overshoot": 0.3}),
+        ("fmu", FINE),
+        ("kinematic", DISTURBED),
+    ]
 )
 def build(request):
     """Return a function that builds a plant for one lane or for an array of lanes, under bad sensing."""

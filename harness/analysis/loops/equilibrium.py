@@ -32,6 +32,7 @@ from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import map_arrays
 from servobench.plant.contract.sensing import without_disturbance
 from servobench.plant.contract.signals import Command, Observation, trusted_observation
@@ -280,7 +281,12 @@ def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> A
     """Return the linear model of the kinematic plant with these settings and a Jacobian (m, n).
 
     Frames that come less often than commands count as later by their mean additional age.
+
+    Raises:
+        ConfigurationError: joints that overshoot, which the model does not have.
     """
+    if config.overshoot > 0.0:
+        raise ConfigurationError(f"kinematic.overshoot must be 0 for a linear model, got {config.overshoot:g}")
     age = max(config.sensing.frame_period - period, 0.0) / 2.0
     return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency + age)
 

@@ -21,7 +21,7 @@ from typing import Any, Final, final
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.description import toml
-from servobench.harness.config.settings import default_config, file_stem
+from servobench.harness.config.settings import default_config, file_stem, flatten
 from servobench.harness.studies.tuning.objective import TuningSet, score
 from servobench.harness.studies.tuning.scoring import (
     LEDGER,
@@ -36,6 +36,7 @@ from servobench.harness.studies.tuning.search import StudyRecord, first_points, 
 from servobench.harness.studies.tuning.spaces import (
     Point,
     default_values,
+    edges,
     find_space,
     find_tunable,
     nested_settings,
@@ -169,6 +170,7 @@ class Method:
             checked_score_of_defaults=score([theirs[i] for i in checked]),
             settings=best.settings,
             studies=tuple(records),
+            edges=edge_lines(self.name, best.settings),
         )
 
 
@@ -241,10 +243,20 @@ class TunedValues:
     checked_score_of_defaults: float
     settings: Mapping[str, Any]  # nested values
     studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
+    edges: tuple[str, ...] = ()  # a line for each number at an edge of its box, which is wider in the next study
 
     def tuning_set(self) -> TuningSet:
         """Return the runs on which the values were found."""
         return TuningSet(self.plants, self.robots, self.offset)
+
+
+def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
+    space: Mapping[str, Any] = find_space(name)
+    values, lines = flatten(nested), []
+    for key, end in edges(space, values).items():
+        lines.append(f"{key} = {values[key]:.4g} is at the {end} edge of {space[key].low:g} to {space[key].high:g}")
+    return tuple(lines)
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:

@@ -1,22 +1,23 @@
 """The objective of tuning, and the runs on which it is measured.
 
-For each plant, `robots` runs under each of seven conditions: latencies of 0 to 150 ms, usual and fourfold noise, four
-times moves (the task `random`, cut to 6 s), twice a circle and once a figure of eight, both smaller and shorter than
-those of the tasks. On one circle the whole delay is that of the camera and commands take effect at once. Every run is
-another robot of `moderate` mismatch; of each second one the camera is turned by 30° or 60°.
+For each plant, `robots` runs in each of eight worlds. A world has a task and a control rate of `KINDS`, among them
+moves that leave the box of the networks, 5 Hz and 125 Hz, and one of the levels of each of `LEVELS`: latency, noise,
+faults of the detector and the drive. Every run has a robot of its own with one of `MODELS`, from `moderate` to joint
+zeros that are wrong by up to 180°. Levels and models occur equally often, as far as their number allows, in an order
+that the seed of the set draws: so nobody has chosen which of them meet, and the second set has other worlds.
 
-    score = mean over the runs of weight · cost                              (0 is perfect, 2 the worst)
+    score = mean over the runs of weight · cost                              (0 is perfect, 1 the worst)
 
-    weight: 7/8 of each of the many moves, 7/6 of each of the few curves; their mean is 1
+    weight: the same for all moves and for all curves, such that both kinds count alike; their mean is 1
 
-    move:   cost = settling time / duration
-                   1 + e / (e + 50 mm), e the RMS error of the last quarter, if it never settled
-    curve:  cost = 2 e / (e + 50 mm), e the RMS error of the second lap
-    2 if the run did not complete
+    move:   cost = mean over the run of log₁₀(e / 1.5 mm) / log₁₀(1 m / 1.5 mm)
+    curve:  the same of the RMS error of the second lap
+    1 if the run did not complete
 
-So moves and curves have the same weight: a second of settling time on all moves counts about as much as 4 mm on all
-curves.
-Overshoot has no term of its own: it lengthens the settling time, since the error must come back and stay within 5 mm.
+Errors e below the floor of 1.5 mm cost nothing, and above 1 m all the same. The cost is continuous in the error: a run
+that comes within the settling band late, or leaves it for one period, costs hardly more than one that does not. Each
+instant of a move counts alike, so a second more at an error costs the same whenever it is spent, and for an approach
+at one rate the cost grows in proportion to the settling time. A curve's cost is the logarithm of what it is judged by.
 """
 
 from __future__ import annotations
@@ -32,57 +33,62 @@ from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_siz
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest, Varied, read_mismatch
 from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Periods, settings
-
-
-@dataclass(frozen=True)
-class Condition:
-    """The condition that the runs of a block share."""
-
-    task: str
-    latency: float  # [s] of the camera
-    noise_factor: float  # of the sensor
-    weight: float  # of a run in the score
-    command_delay: float | None = None  # [s] None for the plant's own
-
-    @property
-    def varied(self) -> Varied:
-        """Settings of the plant in these runs."""
-        delay = () if self.command_delay is None else (("plant.command_delay", self.command_delay),)
-        return (("noise", self.noise_factor), ("latency", self.latency), *delay)
-
+from servobench.plant.contract.settings import Count, Periods, settings
+from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
 MOVE: Final = "random"
-CONDITIONS: Final = (
-    Condition(MOVE, 0.0, 1.0, weight=7 / 8),
-    Condition(MOVE, 0.05, 4.0, weight=7 / 8),
-    Condition(MOVE, 0.1, 1.0, weight=7 / 8),
-    Condition(MOVE, 0.15, 4.0, weight=7 / 8),
-    Condition("circle", 0.0, 1.0, weight=7 / 6),
-    Condition("circle", 0.05, 1.0, weight=7 / 6, command_delay=0.0),
-    Condition("lemniscate", 0.1, 4.0, weight=7 / 6),
+TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
+    MOVE: {"duration": 6.0},
+    "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
+    "lemniscate": {"radius": 0.14, "lap_time": 5.0},
+}  # settings of the tasks, short because a settled run needs no more time
+BEYOND: Final = 0.5  # [rad] by which the box of start and target is larger each way in moves that leave the networks'
+_LEAVING: Final[Varied] = (
+    ("task.lower", tuple(low - BEYOND for low in TRAINING_LOWER)),
+    ("task.upper", tuple(high + BEYOND for high in TRAINING_UPPER)),
 )
-WEIGHTS: Final[Mapping[str, float]] = {condition.task: condition.weight for condition in CONDITIONS}
-MISMATCHES: Final = (
-    "moderate",
-    "moderate+camera_rotation=60deg",
+KINDS: Final[tuple[tuple[str, Varied], ...]] = (
+    (MOVE, ()),
+    (MOVE, ()),
+    (MOVE, _LEAVING),
+    (MOVE, (("period", 0.2),)),
+    (MOVE, (("period", 0.008), ("task.duration", 2.0))),
+    ("circle", ()),
+    ("circle", (("period", 0.1),)),
+    ("lemniscate", (("period", 0.1),)),
+)
+"""Task and varied settings of each world."""
+LEVELS: Final[Mapping[str, tuple[Any, ...]]] = {
+    "latency": (0.0, 0.05, 0.1, 0.15),  # [s]
+    "noise": (1.0, 4.0),  # factor
+    "detector": ("", "", "", "", "+outliers=5%", "+outliers=20%", "+jitter=100ms", "+lost_frames=50%"),
+    "drive": ((), (), (), (), (), (), (("plant.command_delay", 0.0),), (("plant.overshoot", 0.3),)),
+}
+"""One level of each is that of a world."""
+MODELS: Final = (
     "moderate",
     "moderate+camera_rotation=30deg",
-)  # of the robots of a condition, in turn
-MOVE_DURATION: Final = 6.0  # [s]
-TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
-    MOVE: {"duration": MOVE_DURATION},
-    "circle": {"radius": 0.2, "lap_time": 6.0},  # at 0.21 m/s, the whole task at 0.19 m/s
-    "lemniscate": {"radius": 0.17, "lap_time": 6.0},
-}  # settings of the tasks, short because a settled run needs no more time
-ERROR_SCALE: Final = 0.05  # [m] error at which half of the worst cost of errors is reached
-WORST: Final = 2.0  # cost of a run that did not complete, and most of any run
+    "moderate+camera_rotation=60deg",
+    "moderate+camera_rotation=120deg",
+    "moderate+joint_offsets=45deg",
+    "moderate+joint_offsets=90deg",
+    "moderate+joint_offsets=180deg",
+    "moderate+gear_ratio=50%",
+)
+"""The mismatch of a robot."""
+WEIGHTS: Final[Mapping[str, float]] = {
+    task: len(KINDS) / 2 / sum((task == MOVE) == (other == MOVE) for other, _ in KINDS) for task, _ in KINDS
+}
+FLOOR: Final = 0.0015  # [m] error below which nothing is gained; that of `log_error` where the band is 5 mm
+DECADES: Final = math.log10(1.0 / FLOOR)  # from the floor to 1 m
+WORST: Final = 1.0  # cost of a run that did not complete, and most of any run
 MIN_DELAY_MARGIN: Final = 0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
 SECOND_OFFSET: Final = len(TUNING) // 2  # where in the tuning range the seeds of the second sets begin
 SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
@@ -94,16 +100,14 @@ class TuningSet:
 
     plants: tuple[str, ...] = ("kinematic",)
     """names of plants whose latency can be set"""
-    robots: int = 4
-    """under each condition on each plant: 2, 4, 6, …, so that cameras as they are and turned ones have equal shares"""
+    robots: Count = 4
+    """in each world on each plant"""
     offset: Periods = 0
-    """where in the tuning range the seeds begin"""
+    """where in the tuning range the seeds begin; it also draws the worlds"""
 
     def __post_init__(self) -> None:
-        """Refuse an odd share of cameras, seeds outside the tuning range, and a plant without latency."""
-        if self.robots < 2 or self.robots % 2:
-            raise ValueError(f"robots must be 2, 4, 6, …, so that half of the cameras are turned; got {self.robots}")
-        tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
+        """Refuse seeds outside the tuning range, and a plant without latency."""
+        tuning_seeds(len(KINDS) * self.robots, self.offset)
         if not self.plants:
             raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
@@ -116,27 +120,31 @@ class TuningSet:
         return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
 
     def runs(self) -> list[RunRequest]:
-        """Return all runs, still without a controller, the robots of a condition one after the other."""
-        seeds = tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
-        mismatches = [read_mismatch(text) for text in MISMATCHES]
-        return [
-            RunRequest(
-                plant,
-                "",
-                condition.task,
-                mismatches[robot % len(mismatches)],
-                seeds[c * self.robots + robot],
-                condition.varied,
-            )
-            for plant in self.plants
-            for c, condition in enumerate(CONDITIONS)
-            for robot in range(self.robots)
-        ]
+        """Return all runs, still without a controller, the robots of a world one after the other."""
+        count = len(KINDS) * self.robots
+        seeds, models = tuning_seeds(count, self.offset), self._drawn("model", MODELS, count)
+        level = {name: self._drawn(name, levels, len(KINDS)) for name, levels in LEVELS.items()}
+        runs = []
+        for plant in self.plants:
+            known = flatten(find_plant(plant).config())  # rendered drives have no setting for their overshoot
+            drives = [[pair for pair in drive if pair[0].partition(".")[2] in known] for drive in level["drive"]]
+            for run, (seed, model) in enumerate(zip(seeds, models, strict=True)):
+                world = run // self.robots
+                task, varied = KINDS[world]
+                own = *varied, *drives[world], *((key, level[key][world]) for key in ("noise", "latency"))
+                mismatch = read_mismatch(model + level["detector"][world])
+                runs.append(RunRequest(plant, "", task, mismatch, seed, own))
+        return runs
+
+    def _drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
+        """Return `count` levels, each as often as the others as far as possible, in an order drawn for this set."""
+        order = named_generator(self.offset, name).permutation(count)
+        return [levels[index % len(levels)] for index in order]
 
     def checked(self) -> list[int]:
         """Return the indices of a subset small enough for a test: two robots on moves, two on a circle."""
-        curves = next(c for c, condition in enumerate(CONDITIONS) if condition.task != MOVE)
-        return [c * self.robots + robot for c in (1, curves) for robot in (0, 1)]
+        curve = next(world for world, (task, _) in enumerate(KINDS) if task != MOVE)
+        return sorted({world * self.robots + robot for world in (0, curve) for robot in range(min(2, self.robots))})
 
 
 @dataclass(frozen=True)
@@ -161,12 +169,8 @@ def run_cost(task: str, row: Mapping[str, Any]) -> float:
     weight = WEIGHTS[task]
     if row["status"] != COMPLETED:
         return weight * WORST
-    error = float(row["rms_error_evaluated"])
-    saturated = error / (error + ERROR_SCALE)
-    if task != MOVE:
-        return weight * WORST * saturated
-    settling_time = float(row["settling_time_s"])
-    return weight * (1.0 + saturated if math.isnan(settling_time) else settling_time / MOVE_DURATION)
+    decades = float(row["log_error"]) if task == MOVE else math.log10(max(row["rms_error_evaluated"] / FLOOR, 1.0))
+    return weight * min(decades / DECADES, WORST)
 
 
 def score(costs: Sequence[float]) -> float:

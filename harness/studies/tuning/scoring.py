@@ -123,7 +123,7 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
 
 def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
     """Return everything except the settings on which costs depend, as JSON."""
-    constants = ("CONDITIONS", "MISMATCHES", "TASKS", "ERROR_SCALE", "MIN_DELAY_MARGIN", "WORST")
+    constants = ("KINDS", "LEVELS", "MODELS", "TASKS", "FLOOR", "MIN_DELAY_MARGIN", "WORST")
     return {
         "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
         "objective": {name: repr(getattr(objective, name)) for name in constants},

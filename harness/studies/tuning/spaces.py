@@ -9,13 +9,17 @@ it an arm drifts to its stops in half an hour. A delay or response that is given
 guess where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid.
 A combination that cannot be built has the worst score without a run.
 
-The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: it never looks at the
-camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles around
-the target on the rendered plant, whose joints answer one period earlier.
+A number that a study leaves at an edge of its box is reported beside the tuned values, and the next study of the method
+searches a box that is wider there (`widened`), unless the end is one of `LIMITS`.
+
+The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: by default it ignores
+the camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles
+around the target on the rendered plant, whose joints answer one period earlier.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any, Final, TypeAlias
 
@@ -24,7 +28,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from servobench.controllers.aids import RANGES, SWITCHES
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import flatten, nest
+from servobench.harness.config.settings import flatten, nest, tuned_settings
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
@@ -34,6 +38,18 @@ Point: TypeAlias = Mapping[str, Any]
 """A value for each key of a space."""
 
 DIGITS: Final = 3  # of a tuned number: more would pretend to a precision that no study has
+EDGE: Final = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
+WIDER: Final = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
+LIMITS: Final[Mapping[str, float]] = {
+    "aids.map_error": 0.1,  # with more the identified noise would be too small, and the delay biased
+    "law.horizon": 10,  # the preview has no more steps,
+    "law.horizon_time": 0.5,  # and is no longer
+    "law.k": 1.9,  # below 2, from which on these two diverge
+    "estimator.k2": 1.9,
+    "estimator.step_factor": 1.0,  # bounds of the classes; of cfdl_mfac the box ends beside the bound
+    "estimator.initial_covariance": 100.0,
+}
+"""Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
 
 def _log(low: float, high: float) -> FloatDistribution:
@@ -67,7 +83,7 @@ _RBFNN: Final[Space] = {
     "training.controller.gain": FloatDistribution(2.0, 5.0, step=1.0),  # 1/s; each value is a training of its own
 }
 _RBF: Final[Space] = {
-    "estimator.k2": FloatDistribution(0.05, 1.8),
+    "estimator.k2": _log(0.05, 1.8),
     "estimator.epsilon": _log(1e-5, 1e-2),  # rad²
 }
 _LYAPUNOV: Final[Space] = {
@@ -107,7 +123,9 @@ def _aids(without: Collection[str] = ()) -> Space:
 
 
 _MPC_SWITCHES: Final[Space] = {"law.mode": CategoricalDistribution(("constant", "moves")), "law.use_preview": _SWITCH}
+_START: Final[Space] = {"initial.source": CategoricalDistribution(("nominal", "probe"))}
 _RBFNN_SWITCHES: Final[Space] = {
+    "law.offset_free": _SWITCH,
     "law.preview": _SWITCH,
     "law.row_space_only": _SWITCH,
     "law.anti_windup": _SWITCH,
@@ -118,19 +136,19 @@ SPACES: Final[Mapping[str, Space]] = {
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
     "map_mfac": {**_aids(), **_MFAC},
     "arm_mfac": {**_aids(), **_MFAC, **_ARM},
-    "ukf_mfac": {**_aids(), **_MFAC, **_UKF},
+    "ukf_mfac": {**_aids(), **_START, **_MFAC, **_UKF},
     "ukf_mfac:published": {**_MFAC, **_UKF},
-    "ukf_mpc": {**_aids({"feedforward", "limit"}), **_MPC_SWITCHES, **_MPC, **_UKF},
+    "ukf_mpc": {**_aids({"feedforward", "limit"}), **_START, **_MPC_SWITCHES, **_MPC, **_UKF},
     "ukf_mpc:published": {**_MPC, **_UKF},
     "rbf_pid": {**_aids(), **_PID, **_LYAPUNOV},
     "rbf_pid:published": {**_P, **_LYAPUNOV},
     "constant": _PI,
     "calibrated": _PI,
-    "broyden": {**_aids(), **_PID, **_BROYDEN},
+    "broyden": {**_aids(), **_START, **_PID, **_BROYDEN},
     "broyden:published": {**_P, **_BROYDEN},
-    "rls": {**_aids(), **_PID, **_RLS},
+    "rls": {**_aids(), **_START, **_PID, **_RLS},
     "rls:published": {**_P, **_RLS},
-    "cfdl_mfac": {**_aids(), **_MFAC, **_CFDL},
+    "cfdl_mfac": {**_aids(), **_START, **_MFAC, **_CFDL},
     "cfdl_mfac:published": {**_MFAC, **_CFDL},
 }
 
@@ -148,14 +166,49 @@ def find_tunable(name: str) -> ControllerEntry:
 
 
 def find_space(name: str) -> Space:
-    """Return the search space of a controller, its switches first.
+    """Return the search space of a controller, its switches first and its boxes widened around the values in use.
 
     Raises:
         ConfigurationError: an unknown controller, or one without a space.
     """
     find_tunable(name)
-    space = SPACES[name]
+    space = widened(SPACES[name], flatten(tuned_settings(name)))
     return {key: space[key] for key in sorted(space, key=lambda key: not is_switch(space[key]))}
+
+
+def edges(space: Space, values: Point) -> dict[str, str]:
+    """Return which numbers lie at an edge of their box, or beyond: by key the word lower or upper.
+
+    Args:
+        space: the boxes.
+        values: of some of its keys.
+    """
+    found = {}
+    for key, value in values.items():
+        box = space.get(key)
+        if box is None or isinstance(box, CategoricalDistribution):
+            continue
+        low, high, at = (math.log(each) if box.log else each for each in (box.low, box.high, value))
+        share = (at - low) / (high - low)
+        if share < EDGE and box.low > (box.step or 0.0):
+            found[key] = "lower"
+        elif share > 1.0 - EDGE and box.high < LIMITS.get(key, math.inf):
+            found[key] = "upper"
+    return found
+
+
+def widened(space: Space, values: Point) -> Space:
+    """Return the space with wider boxes for those of `values` that lie at an edge; see `edges`."""
+    wider = dict(space)
+    for key, end in edges(space, values).items():
+        box: Any = space[key]
+        low, high = min(box.low, values[key]), max(box.high, values[key])
+        if end == "upper":
+            high = min(high * WIDER if box.log else 2 * high - low, LIMITS.get(key, math.inf))
+        else:
+            low = low / WIDER if box.step is None else max(2 * low - high, box.step)
+        wider[key] = type(box)(low, high, log=box.log, step=box.step)
+    return wider
 
 
 def is_switch(distribution: Distribution) -> bool:

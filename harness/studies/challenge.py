@@ -1,0 +1,192 @@
+"""Challenges: named worlds that tell methods apart, a TOML file each.
+
+    title, why         what the world is, and a sentence of physics
+    task, mismatch     as of a run; period [s], latency [s] and noise (a factor) where they differ from the usual ones
+    measure            settling: the settling time of a move; path: the RMS error of the judged part, as of the last lap
+    reference          methods that know the true robot; on each robot the better one bounds the others. They run on
+                       the first `reference_seeds` robots, or on all
+    [settings]         further settings, SECTION.KEY = VALUE, of the sections run, plant and task
+    plants, picture    those on which it is carried out unless a user names others; a file beside it
+    [grade]            name, date and the mean scores of the methods that gave it, written once
+
+Grade I: all equipped methods pass. II: the best and the worst of them differ by a factor of three or by 30 points of
+lost runs, or another one is the first beyond its interval. III: the best is below half of the reference's score. The
+files of the folder `challenges` are known by their names; a user adds a challenge by the path of a file.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
+
+from servobench.harness.batch.plan import Batch, Cell
+from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.run.experiment import draw
+from servobench.harness.run.request import SHORT_NAMES
+from servobench.harness.run.resolution import resolve
+from servobench.harness.run.tasks import choose_task
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.contract.settings import (
+    Count,
+    Names,
+    NonNegative,
+    Number,
+    Positive,
+    nested,
+    override,
+    settings,
+    suggest,
+)
+
+GRADES: Final = ("I", "II", "III")
+SUFFIX: Final = ".toml"
+OWN_SECTIONS: Final = ("run.", "plant.", "task.")  # whose settings a challenge may change
+FOLDER: Final = files("servobench.harness.studies") / "challenges"
+
+
+class Measure(NamedTuple):
+    """What a challenge judges.
+
+    Attributes:
+        column: of the table of runs; less is better.
+        floor: below which a difference does not count [unit of the column, m for positions].
+        factor: from the column to the unit in which it is shown.
+        unit: in which it is shown.
+        achieved: the word for a run that is not lost.
+    """
+
+    column: str
+    floor: float
+    factor: float
+    unit: str
+    achieved: str
+
+
+MEASURES: Final[Mapping[str, Measure]] = {
+    "settling": Measure("settling_time_s", 0.05, 1.0, "s", "settled"),
+    "path": Measure("rms_error_evaluated", 0.0015, 1000.0, "mm", "followed"),
+}
+
+
+@settings
+class Grade:
+    """How hard a challenge was on the day on which it was graded; see the module."""
+
+    name: Literal["", "I", "II", "III"] = ""
+    date: datetime.date | None = None
+    scores: dict[str, Number] = field(default_factory=dict)
+
+
+@settings
+class Challenge:
+    """A named world: the stem of its file, and the keys in it; see the module."""
+
+    name: str
+    title: str = ""
+    why: str = ""
+    task: str = ""
+    mismatch: str = "moderate"
+    measure: Literal["settling", "path"] = "settling"
+    reference: Names = ()
+    plants: Names = ("kinematic", "fmu")
+    period: Positive | None = None
+    latency: NonNegative | None = None
+    noise: NonNegative | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    reference_seeds: Count | None = None
+    picture: str = ""
+    grade: Grade = nested(Grade)
+
+    def cells(
+        self, plants: Sequence[str], controllers: Sequence[str], seeds: Sequence[int], bounded: int | None = None
+    ) -> list[Cell]:
+        """Return the runs of methods and references.
+
+        Args:
+            plants: names; none for those of the file.
+            controllers: names of methods.
+            seeds: of the robots.
+            bounded: number of robots on which the references run; None for what the file says.
+        """
+        short = {name: getattr(self, name) for name in SHORT_NAMES if getattr(self, name) is not None}
+        varied = tuple((short | flatten(self.settings)).items())
+        methods = tuple(name for name in controllers if name not in self.reference)
+        robots = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
+        return [
+            Cell(replace(request, varied=varied))
+            for names, own in robots.items()
+            for request in Batch(tuple(plants) or self.plants, names, (self.task,), (self.mismatch,), own).requests()
+        ]
+
+    def check(self) -> None:
+        """Refuse what cannot be carried out or judged.
+
+        Raises:
+            ValueError: names it.
+        """
+        for key in ("title", "why", "reference"):
+            if not getattr(self, key):
+                raise ValueError(f"{key} is missing")
+        for name in self.reference:
+            if not find_controller(name).needs_truth:
+                raise ValueError(f"reference {name} does not know the true robot; wanted calibrated, nmpc_calibrated")
+        for key in flatten(self.settings):
+            if not key.startswith(OWN_SECTIONS):
+                raise ValueError(f"settings: {key} must begin with one of {', '.join(OWN_SECTIONS)}")
+        run = resolve(self.cells((), (), [0])[0].request, Settings())
+        own_robot = find_plant(run.request.plant).own_robot
+        if self.measure == "settling" and not own_robot and draw(run).scenario.kind != "point_to_point":
+            raise ValueError(f"measure settling is for moves, and {self.task} is a curve; wanted path")
+
+
+def challenge_names() -> list[str]:
+    """Return the names of the challenges of this package."""
+    return sorted(file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX))
+
+
+def choose_challenges(words: Sequence[str], grades: Sequence[str]) -> list[Challenge]:
+    """Return the challenges of names or files; of these grades only, if any are named.
+
+    Raises:
+        ConfigurationError: an unknown grade, two files of one name, or no challenge of these grades.
+    """
+    for grade in grades:
+        if grade not in GRADES:
+            raise ConfigurationError(f"unknown grade {grade!r}: wanted {', '.join(GRADES)}")
+    found = [find_challenge(word) for word in words]
+    names = [each.name for each in found]
+    if again := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"two challenges are called {again[0]}; give one of the files another name")
+    found.sort(key=lambda each: each.grade.name or "ungraded")
+    chosen = [each for each in found if not grades or each.grade.name in grades]
+    if not chosen:
+        raise ConfigurationError(f"none of these challenges is of grade {' or '.join(grades)}: {', '.join(names)}")
+    return chosen
+
+
+def find_challenge(word: str) -> Challenge:
+    """Return the challenge of a name or of a file that ends in `.toml`.
+
+    Raises:
+        ConfigurationError: there is none, or one line with the fault of its file.
+    """
+    if not word.endswith(SUFFIX) and word not in challenge_names():
+        raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
+    try:
+        path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
+        values = read_toml("challenge", path)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+    try:
+        values["task"] = choose_task(values.get("task", ""))
+        challenge = override("challenge", Challenge(path.stem), values)
+        challenge.check()
+    except ValueError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+    return challenge

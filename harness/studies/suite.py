@@ -1,0 +1,203 @@
+"""The suite: methods over challenges, judged against references that know the true robot.
+
+A challenge is a part of the results folder. On each robot the better of its references bounds the others:
+
+    score = min(1, max(reference, floor) / max(own, floor)),   0 for a lost run
+
+A run is lost if it does not settle, on a curve if it is not followed. A challenge whose references both lose more than
+`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.comparison import column_of, outcomes
+from servobench.harness.analysis.scores import profile, ranking, resolution, scores
+from servobench.harness.analysis.statistics import median_with_interval, success_rate
+from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
+from servobench.harness.batch.plan import Cell as Run
+from servobench.harness.config.settings import Settings
+from servobench.harness.pictures.style import (
+    TEXT,
+    WIDTH,
+    add_legend,
+    figure_style,
+    method_styles,
+    plain_logarithms,
+    save_figure,
+)
+from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.resolution import check_settings
+from servobench.harness.run.result import COMPLETED
+from servobench.harness.studies.challenge import MEASURES, Challenge
+
+MAX_REFERENCE_LOSS: Final = 0.05
+REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see what all methods see
+RUNS, METHODS, RANKING, PICTURE = "scores.csv", "methods.csv", "ranking.csv", "suite"
+FACTORS: Final = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
+DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
+
+
+def carry_out_suite(
+    out: Path,
+    challenges: Sequence[Challenge],
+    runs: Mapping[str, Sequence[Run]],
+    settings: Settings,
+    how: Execution,
+) -> pd.DataFrame:
+    """Carry out the runs of challenges, judge them, write tables and pictures, and return the judged runs.
+
+    Args:
+        out: folder of the suite; each challenge has its own in it.
+        challenges: the worlds.
+        runs: of each challenge by its name, references included.
+        settings: overrides of the defaults of methods and worlds.
+        how: how the runs are carried out.
+
+    Raises:
+        ConfigurationError: settings that nothing reads or that a challenge fixes, or as `carry_out_parts`.
+    """
+    requests = [run.request for own in runs.values() for run in own]
+    check_settings(settings, [name for each in requests for name in (each.plant, each.controller, each.task)])
+    check_effects(settings, requests, steps=False)
+    sections = {
+        name: {**REFERENCE_SETTINGS.get(name, {}), **settings.sections.get(name, {})}
+        for name in {*REFERENCE_SETTINGS, *settings.sections}
+    }
+    parts = {name: Campaign(own, Settings(sections)) for name, own in runs.items()}
+    tables = carry_out_parts(parts, out, how)
+    judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
+    judged.to_csv(out / RUNS, index=False)
+    for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
+        pd.json_normalize(as_plain(rows)).to_csv(out / name, index=False)
+    for plant, own in bounded(judged).groupby("plant", sort=False):
+        draw_suite(own, out / f"{PICTURE}_{Path(str(plant)).stem}")
+    return judged
+
+
+def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs of a challenge with their scores.
+
+    Returns:
+        A row a run: challenge, grade, plant, controller, seed; `measured` in the unit that is shown, NaN where there is
+        none; `value`, the same raised to the floor and NaN of a lost run; `score`, NaN where no reference ran;
+        `reference`, the value of the better one, NaN where it is lost.
+    """
+    measure = MEASURES[challenge.measure]
+    measured = measure.factor * column_of(runs, measure.column).where(runs["status"] == COMPLETED)
+    value = measured.where(outcomes(runs).isin(ACHIEVED)).clip(lower=measure.factor * measure.floor)
+    robots = pd.MultiIndex.from_frame(runs[["plant", "seed"]])
+    is_reference = runs["controller"].isin(challenge.reference)
+    best = value[is_reference].groupby([runs["plant"], runs["seed"]]).min()
+    reference = best.reindex(robots).to_numpy()
+    known = robots.isin(best.index)
+    return runs[["plant", "controller", "seed"]].assign(
+        challenge=challenge.name, title=challenge.title, grade=challenge.grade.name, measure=challenge.measure,
+        measured=measured, value=value, reference=reference,
+        score=np.where(known, scores(value, reference, measure.factor * measure.floor), np.nan),
+    )  # fmt: skip
+
+
+def bounded(judged: pd.DataFrame) -> pd.DataFrame:
+    """Return the judged runs with a score whose references lose few enough robots to bound them."""
+    known = judged[judged["score"].notna()]
+    lost = known.groupby(["challenge", "plant"])["reference"].transform(lambda own: own.isna().mean())
+    return known[lost <= MAX_REFERENCE_LOSS]
+
+
+def methods_rows(judged: pd.DataFrame) -> list[Row]:
+    """Return a row for each challenge, plant and method, best first: its good runs, median, lost runs, mean score."""
+    rows: list[Row] = []
+    for _, place in judged.groupby(["challenge", "plant"], sort=False):
+        best = place[place["score"].notna()].drop_duplicates("seed")["reference"]
+        about = {name: Cell(str(place[name].iloc[0])) for name in ("challenge", "grade", "plant", "measure")}
+        about["reference"] = Cell(median_with_interval(best).value, ".2f")
+        about["reference_lost"] = Cell(100.0 * float(best.isna().mean()), ".1f")
+        means = place.groupby("controller", sort=False)["score"].mean().sort_values(ascending=False, kind="stable")
+        for name, score in means.items():
+            own = place[place["controller"] == name]
+            good = success_rate(int(own["value"].notna().sum()), len(own)).scaled(100.0)
+            rows.append(
+                {**about, "controller": Cell(str(name)), "runs": Cell(float(len(own)), ".0f"),
+                 "good": Cell(good, ".0f"), "median": Cell(median_with_interval(own["measured"]), ".2f"),
+                 "lost": Cell(100.0 - good.value, ".0f"), "score": Cell(float(score), ".2f")}
+            )  # fmt: skip
+    return rows
+
+
+def ranking_rows(judged: pd.DataFrame) -> list[Row]:
+    """Return a row for each plant and method: rank, interquartile mean of its scores, lost runs and profile."""
+    rows: list[Row] = []
+    for plant, own in bounded(judged).groupby("plant", sort=False):
+        shares = profile(own, FACTORS)
+        for each in ranking(own):
+            row = {"plant": Cell(str(plant)), "controller": Cell(each.controller), "rank": Cell(each.rank)}
+            row |= {"score": Cell(each.score, ".2f"), "lost, %": Cell(100.0 * each.lost, ".1f")}
+            within = zip(FACTORS, shares[each.controller], strict=True)
+            rows.append(row | {f"within {factor:g}×": Cell(float(share), ".2f") for factor, share in within})
+    return rows
+
+
+def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield titles and tables of text: one for each challenge and plant, and the ranking on each plant."""
+    titles = dict(zip(judged["challenge"], judged["title"], strict=True))
+    rows = as_text(methods_rows(judged))
+    for (name, plant), place in rows.groupby(["challenge", "plant"], sort=False):
+        about, measure = place.iloc[0], MEASURES[place["measure"].iloc[0]]
+        fails = float(about["reference_lost"]) > 100.0 * MAX_REFERENCE_LOSS
+        grade = "no grade, as its references fail" if fails else about["grade"] or "ungraded"
+        bound = f"reference {about['reference']} {measure.unit}, lost {about['reference_lost']} %"
+        heads = {"controller": "controller", "runs": "runs", "good": f"{measure.achieved}, %",
+                 "median": f"median, {measure.unit}", "lost": "lost, %", "score": "score"}  # fmt: skip
+        yield f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}", place[list(heads)].rename(columns=heads)
+    if ranks := ranking_rows(judged):
+        for plant, place in as_text(ranks).groupby("plant", sort=False):
+            own = bounded(judged)
+            own = own[own["plant"] == plant]
+            title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
+            if own.groupby("challenge")["seed"].nunique().min() > 1:
+                title += f"; halves of the robots differ by {resolution(own).difference:.3f} in the score"
+            yield title, place.drop(columns="plant")
+
+
+def draw_suite(runs: pd.DataFrame, stem: Path) -> list[Path]:
+    """Draw performance profiles and the mean score of each method in each challenge; return the files.
+
+    Args:
+        runs: bounded judged runs of one plant.
+        stem: of the files.
+    """
+    means = runs.pivot_table("score", "controller", "challenge", sort=False)
+    means = means.loc[[each.controller for each in ranking(runs)]]
+    shares, styles = profile(runs, DRAWN_FACTORS), method_styles(means.index)
+    with figure_style(TEXT):
+        heights = (2.2, 0.9 + 0.19 * len(means))
+        figure = Figure(figsize=(WIDTH, sum(heights) + 0.9), layout="constrained")
+        top, bottom = figure.subplots(2, 1, height_ratios=heights)
+        for name in means.index:
+            top.plot(shares.index, shares[name], label=name, **styles[name].line_arguments(len(shares)))
+        plain_logarithms(top, "x")
+        top.set(xlabel="times the best method of the run", ylabel="share of runs", ylim=(0.0, 1.02))
+        top.set_title(f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}")
+        _draw_scores(bottom, means)
+        add_legend(figure, [top])
+    return save_figure(figure, stem)
+
+
+def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:
+    """Draw a cell for each method and challenge; dark is good."""
+    axes.imshow(means, cmap="Blues", vmin=0.0, vmax=1.3, aspect="auto")  # so that text is readable on every cell
+    for (row, column), score in np.ndenumerate(means.to_numpy()):
+        axes.text(column, row, f"{score:.2f}", ha="center", va="center", fontsize=TEXT - 2.0)
+    axes.set_xticks(range(means.shape[1]), means.columns, rotation=40.0, ha="right")
+    axes.set_yticks(range(len(means)), means.index)
+    axes.grid(visible=False)
