@@ -22,6 +22,7 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -248,6 +249,9 @@ class World(Abilities):
         if not self.lead:
             raise fault
         self.faults = {lane: fault, **self.faults}
+
+    mechanics: MechanicsConfig = MechanicsConfig()
+    """Gears and tool."""
 
     noise_unit: float = 1.0
     """A metre of noise in the unit of the features."""
