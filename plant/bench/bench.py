@@ -273,8 +273,11 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        sensing, delay, lag = self._sensing, self._command_delay, self.world.lag
-        return replace(model, latency=sensing.latency, command_delay=delay, lag=lag, latency_spread=sensing.jitter)
+        sensing = self._sensing
+        return replace(
+            model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
+            latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,
+        )  # fmt: skip
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""
