@@ -39,6 +39,7 @@ class TrueModel:
         command_delay: between a command and its first effect, s.
         lag: time constant of the joints' velocity loops, s; None where it is unknown.
         latency_spread: by which a frame may be later than the latency, s.
+        camera_turn: rate at which the camera turns about its optical axis, rad/s.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
@@ -47,6 +48,7 @@ class TrueModel:
     command_delay: float = 0.0
     lag: float | None = None
     latency_spread: float = 0.0
+    camera_turn: float = 0.0
 
 
 class Abilities(ABC):
