@@ -28,7 +28,6 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.harness.run.tasks import TASKS, find_task
-from servobench.harness.run.turning import Unturned
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -340,11 +339,10 @@ def _build_controller(
     name: str, config: object, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]
 ) -> Controller:
     """Build a controller; the truth goes only to one that asks for it, as the nominal model where there is none."""
-    entry, turn = find_controller(name), 0.0
+    entry = find_controller(name)
     try:
         if entry.needs_truth:
             true = true_model()
-            turn = true.camera_turn
             nominal = knowledge.nominal_jacobian or true.jacobian
             knowledge = replace(
                 knowledge,
@@ -352,9 +350,9 @@ def _build_controller(
                 true_jacobian=true.jacobian,
                 true_symbolic=true.symbolic,
                 true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread),
+                true_camera_turn=true.camera_turn,
             )
-        controller = entry.build(config, knowledge)
-        return Unturned(controller, turn, knowledge) if turn > 0.0 else controller
+        return entry.build(config, knowledge)
     except ValueError as error:
         raise ConfigurationError(f"controller {name}: {error}") from error
 

@@ -235,10 +235,8 @@ class ManyLogs(StepLog):
 
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
-    request, controller = run.request, find_controller(run.request.controller)
-    if not (find_plant(request.plant).side_by_side and controller.side_by_side):
-        return None
-    if controller.needs_truth and run.camera_turn > 0.0:  # a bound is wrapped in one that knows the turn
+    request = run.request
+    if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
         return None
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, moved, request.robot, request.sensing

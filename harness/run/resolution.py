@@ -21,7 +21,6 @@ from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
 
@@ -59,12 +58,6 @@ class ResolvedRun:
     plant: Any
     controller: Any
     task: Task
-
-    @property
-    def camera_turn(self) -> float:
-        """Rate at which the camera turns about its optical axis [rad/s]."""
-        sensing = getattr(self.plant, "sensing", None)
-        return sensing.camera_turn if isinstance(sensing, SensingConfig) else 0.0
 
 
 def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:

@@ -274,15 +274,15 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        sensing, delay, lag = self._sensing, self._command_delay, self.world.lag
-        spread = sensing.jitter + 2.0 * sensing.latency_swing
-        model = replace(model, latency=sensing.latency, command_delay=delay, lag=lag, latency_spread=spread)
-        mechanics, symbolic = self.world.mechanics, model.symbolic
+        sensing, mechanics, symbolic = self._sensing, self.world.mechanics, model.symbolic
         if mechanics.ripple > 0.0:
             a, k = mechanics.ripple, mechanics.ripple_order
             jacobian = RippledJacobian(model.jacobian, mechanics)
             model = replace(model, jacobian=jacobian, symbolic=lambda q: symbolic(q + a * (k * q).sin()))
-        return replace(model, camera_turn=sensing.camera_turn)
+        return replace(
+            model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
+            latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,
+        )  # fmt: skip
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""

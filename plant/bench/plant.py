@@ -39,7 +39,7 @@ class TrueModel:
         command_delay: between a command and its first effect, s.
         lag: time constant of the joints' velocity loops, s; None where it is unknown.
         latency_spread: by which a frame may be later than the latency, s.
-        camera_turn: rate at which the camera turns about its optical axis, rad/s.
+        camera_turn: with which the first camera turns about its optical axis, rad/s.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
