@@ -57,6 +57,7 @@ class RobotKnowledge:
         true_symbolic: a CasADi expression (MX) q, (n, 1) rad -> the expression of the true robot's feature, (m, 1);
             under the same condition.
         true_delays: of the true robot and its camera; under the same condition.
+        true_camera_turn: rad/s, with which the first camera turns about its optical axis; under the same condition.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
@@ -72,6 +73,7 @@ class RobotKnowledge:
     true_jacobian: JacobianFunction | None = None
     true_symbolic: SymbolicFeature | None = None
     true_delays: Delays | None = None
+    true_camera_turn: float = 0.0
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
     unit: float = 1.0

@@ -168,7 +168,7 @@ _ROWS = (
     ),
     Method("constant", "pid", "constant", "pseudo-inverse of the first Jacobian for ever: the lower bound"),
     Method(
-        "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian with the true delays: the upper bound",
+        "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian with the true delays: a bound of its law",
         {}, _GIVEN,
     ),
     Method(

@@ -75,7 +75,8 @@ class NmpcCalibrated(Controller):
     Without `image`, b = 0: the effect of perfect calibration alone, which no feedback reaches. With it the control is
     offset-free: b is the median, component by component, of y − h(q(t − a)) over the frames of `image_window`, with the
     true age a of each frame, so that fewer than half of them may be outliers. Where frames are late by unknown times, a
-    is the age within the true bounds at which the frame agrees best with the present b.
+    is the age within the true bounds at which the frame agrees best with the present b. Where the camera is known to
+    turn, features and reference are taken into the frame of its first pose.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -120,6 +121,7 @@ class NmpcCalibrated(Controller):
             varying_jacobian=True,
         )
         self._program = QpProgram(self._shape, config.solver)
+        self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0  # of points, not of pixels
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
         self._b: FloatArray = np.zeros(m)
         self._offsets: FloatArray = np.zeros((self._frames, m))
@@ -152,7 +154,8 @@ class NmpcCalibrated(Controller):
         if self._config.image:
             self._observe(observation, feature)
         start = present + self._to_come @ self._sent
-        rows = sampled(reference / self._knowledge.unit, self._places)
+        places = np.arange(len(reference)) * self._spec.period
+        rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
         plan, success = self._improve(start, wanted)
@@ -194,10 +197,23 @@ class NmpcCalibrated(Controller):
         self._past = np.vstack([self._past[1:], feature])
         if not observation.feature_valid:
             return
-        offsets = observation.feature / self._knowledge.unit - sampled(self._past, self._exposures)
+        exposed = observation.time - self._spec.period * (self._reach - self._exposures)
+        measured = np.tile(observation.feature / self._knowledge.unit, (len(exposed), 1))
+        offsets = self._fixed(measured, exposed) - sampled(self._past, self._exposures)
         nearest = offsets[np.linalg.norm(offsets - self._b, axis=-1).argmin()]
         self._offsets = np.vstack([self._offsets[1:], nearest])
         self._b = np.median(self._offsets, axis=0)
+
+    def _fixed(self, features: FloatArray, times: FloatArray) -> FloatArray:
+        """Return features (k, m) in the frame of the camera at times (k,) [s] in that of its first pose.
+
+        A camera that is known to turn about its optical axis by ω t shows p(t) = R_z(−ω t) p(0).
+        """
+        if self._turn == 0.0:
+            return features
+        c, s = np.cos(self._turn * times), np.sin(self._turn * times)
+        x, y, z = features.T
+        return np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
     def _evaluate(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         feature, jacobian = self._model(joint_position)

@@ -35,6 +35,8 @@ UNITS: dict[str, dict[str, str]] = {
     "rad/s": {"rad": "1", "s": "-1"},
     "rad/s2": {"rad": "1", "s": "-2"},
     "m/rad": {"m": "1", "rad": "-1"},
+    "m/s": {"m": "1", "s": "-1"},
+    "m/s2": {"m": "1", "s": "-2"},
 }
 DISPLAY_UNITS = {"rad": "deg", "rad/s": "deg/s", "rad/s2": "deg/s2"}
 ATTRIBUTES = {
@@ -92,18 +94,21 @@ def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
     """Return outputs, derivatives, initial unknowns and event indicators of an arm with their dependencies."""
     geometry, computed = ([group.name for group in part] for part in (layout.kinematic, layout.computed))
     state = ("joint_position", "joint_velocity")
-    outputs: _Rows = [(name, (name,), True) for name in state]
+    tool = ("tool_deflection", "tool_velocity")
+    outputs: _Rows = [(name, (name,), True) for name in (*state, *tool)]
     outputs += [("encoder_position", ("joint_position",), True)]
-    outputs += [(name, ("joint_position",), False) for name in computed]
+    outputs += [(name, ("joint_position", tool[0]), False) for name in computed]
     derivatives: _Rows = [
         ("der(joint_position)", state, True),
         ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
+        *((f"der({name})", (*state, *tool), False) for name in tool),
     ]
     start: _Rows = [
         ("joint_position", ("home",), True),
         ("joint_velocity", (), True),
         ("der(joint_position)", (), True),
         ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
+        *((name, (), True) for name in (*tool, *(f"der({name})" for name in tool))),
         ("encoder_position", ("encoder_resolution", "home"), True),
     ]
     start += [(name, (*geometry, "home"), False) for name in computed]
@@ -204,7 +209,7 @@ def _interfaces(root: ET.Element, description: Description, version: int) -> Non
         capabilities |= dict.fromkeys(("providesDirectionalDerivatives", "providesAdjointDerivatives"), derivatives)
     interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
     if description.exchange:
-        own = {"completedIntegratorStepNotNeeded": "true"} if version == 2 else {}
+        own = {"completedIntegratorStepNotNeeded": "false"} if version == 2 else {}
         interfaces = {"ModelExchange": own, **interfaces}
     for name, more in interfaces.items():
         interface = ET.SubElement(root, name, {**capabilities, **more})

@@ -1,11 +1,12 @@
 """Generates the C sources of a model: functions of CasADi, the layout header, and the kinematic core of an arm.
 
-The kinematic core, from the symbolic arm model, has three functions in CasADi's calling convention, which need libm
-only:
+The kinematic core, from the symbolic arm model, has four functions in CasADi's calling convention, which need libm
+only, of the states s = [q, q̇, δ, w], parameters p and the play c, by which joints are behind their gears:
 
-    arm_feature   q, p -> y                    the ball in the camera frame, or features and which of them are seen
-    arm_jacobian  q, p -> J                    of the features, row-major, m × n
-    arm_forward   q, p, q̇, ṗ -> ẏ, J̇          forward derivatives along (q̇, ṗ)
+    arm_feature   s, p, c -> y                 the ball in the camera frame, or features and which of them are seen
+    arm_jacobian  s, p, c -> J                 of the features, row-major, m × n
+    arm_motion    s, p, c -> (p_B, ṗ_B), (δ̇, ẇ)   the target of a rigid tool, and the rates of a flexible one
+    arm_forward   s, p, c, ṡ, ṗ -> (ẏ, J̇), …   forward derivatives along (ṡ, ṗ), of the rates as well
 """
 
 from __future__ import annotations
@@ -126,44 +127,61 @@ def kinematic_size(layout: ArmLayout) -> int:
 
 
 def core_functions(layout: ArmLayout) -> list[Any]:
-    """Return the three functions of the kinematic core of an arm."""
-    n = _size(layout, "joint_position")
-    q, p = casadi.SX.sym("q", n), casadi.SX.sym("p", kinematic_size(layout))
-    dq, dp = casadi.SX.sym("dq", n), casadi.SX.sym("dp", kinematic_size(layout))
-    feature, jacobian = _equations(layout, q, p)
+    """Return the four functions of the kinematic core of an arm."""
+    n, size = _size(layout, "joint_position"), kinematic_size(layout)
+    s, ds = (casadi.SX.sym(name, 2 * n + 6) for name in ("s", "ds"))
+    p, dp = (casadi.SX.sym(name, size) for name in ("p", "dp"))
+    c = casadi.SX.sym("c", n)
+    feature, jacobian, motion, rates = _equations(layout, s, p, c)
     row_major = casadi.vec(jacobian.T)
-    along = casadi.jtimes(casadi.vertcat(feature, row_major), casadi.vertcat(q, p), casadi.vertcat(dq, dp))
+    outputs = casadi.vertcat(feature, row_major), rates
+    along = [casadi.jtimes(each, casadi.vertcat(s, p), casadi.vertcat(ds, dp)) for each in outputs]
     return [
-        casadi.Function("arm_feature", [q, p], [feature], {"cse": True}),
-        casadi.Function("arm_jacobian", [q, p], [row_major], {"cse": True}),
-        casadi.Function("arm_forward", [q, p, dq, dp], [along], {"cse": True}),
+        casadi.Function("arm_feature", [s, p, c], [feature], {"cse": True}),
+        casadi.Function("arm_jacobian", [s, p, c], [row_major], {"cse": True}),
+        casadi.Function("arm_forward", [s, p, c, ds, dp], along, {"cse": True}),
+        casadi.Function("arm_motion", [s, p, c], [motion, rates], {"cse": True}),
     ]
 
 
-def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
-    """Return the outputs before the Jacobian and the Jacobian, for joint positions and kinematic parameters."""
+def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
+    """Return the outputs before the Jacobian, the Jacobian, motion of a rigid tool and rates of a flexible one."""
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
-    arm, view = _arm(part), layout.view
+    arm, view, n = _arm(part), layout.view, c.numel()
+    q, v, deflection, w = (s[first:last] for first, last in ((0, n), (n, 2 * n), (2 * n, 2 * n + 3), (-3, None)))
+    phase = part["ripple_order"] * q
+    x, slope = (
+        q + part["ripple"] * casadi.sin(phase) + c,
+        1.0 + part["ripple"] * part["ripple_order"] * casadi.cos(phase),
+    )
     if view is None:
-        return _ball(q, part, arm)
-    geometry = _view(part, arm, view)
-    points = points_in_cameras(q, geometry, view.mount)
-    feature = features(points, geometry.optics, view.setup)
-    seen = valid_features(points, geometry.optics, view.setup)
-    return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
+        feature, jacobian, place = _ball(x, part, arm, slope, deflection)
+    else:
+        geometry = _view(part, arm, view)
+        places = points_in_cameras(x, geometry, view.mount)
+        seen = valid_features(places, geometry.optics, view.setup)
+        measured = features(places, geometry.optics, view.setup)
+        feature, jacobian = casadi.vertcat(measured, seen), casadi.jacobian(measured, q)
+        place = casadi.SX.zeros(3)  # only the ball hangs on a flexible tool
+    speed = slope * v
+    pushed = casadi.if_else(speed > 0.0, c <= -part["backlash"], c >= part["backlash"])
+    carried = casadi.jtimes(place, q, v * pushed)
+    omega, slip = part["tool_frequency"], w - carried
+    rates = casadi.vertcat(slip, -(omega**2) * deflection - 2.0 * part["tool_damping"] * omega * slip)
+    return feature, jacobian, casadi.vertcat(place, carried), casadi.if_else(omega > 0.0, rates, 0.0)
 
 
-def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry) -> tuple[SX, SX]:
-    """Return the ball in the camera frame, always seen, and ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i))."""
+def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry, slope: SX, deflection: SX) -> tuple[SX, SX, SX]:
+    """Return the ball in the camera frame, always seen; ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i)) × slope; and p_B."""
     R_BC = _rotation(part["camera_rpy"])
     axes, origins, rotation, position = arm_frames(q, arm)
     ball = position + rotation @ part["tool"]
     columns = [
-        arm.gear_ratio[i] * casadi.cross(axis, ball - origin)
+        slope[i] * (arm.gear_ratio[i] * casadi.cross(axis, ball - origin))
         for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
     ]
-    feature = R_BC.T @ (ball - part["camera_position"])
-    return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), R_BC.T @ casadi.horzcat(*columns)
+    feature = R_BC.T @ (ball + deflection - part["camera_position"])
+    return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), R_BC.T @ casadi.horzcat(*columns), ball
 
 
 def _arm(part: Mapping[str, SX]) -> ArmGeometry:

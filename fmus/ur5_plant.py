@@ -21,6 +21,7 @@ from servobench.plant.contract.settings import NonNegative, Positive, nested, se
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.fmu.world import build_fmu
 from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
@@ -45,6 +46,8 @@ class Ur5FmuConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
+    mechanics: MechanicsConfig = nested(MechanicsConfig)
+    """Backlash and ripple of the gears, and a flexible tool."""
 
 
 @cache
@@ -76,8 +79,10 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
-    resolution = config.encoder_resolution
-    actuation = Actuation(np.array(lag), config.max_joint_speed, config.joint_range, start, resolution, setup.limits)
+    resolution, mechanics = config.encoder_resolution, config.mechanics
+    ends = config.max_joint_speed, config.joint_range
+    actuation = Actuation(np.array(lag), *ends, start, resolution, setup.limits, mechanics)
+    mechanics.check(model)
     stops = actuation.stops(n)
     parameters = parameters_of(model, actuation)
     del parameters["home"]
@@ -110,7 +115,9 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     except ValueError as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
     lag = float(np.mean(config.joint_lags or config.lag))
-    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model)
+    bench = build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model)
+    bench.world.mechanics = config.mechanics
+    return bench
 
 
 ENTRY = PlantEntry(

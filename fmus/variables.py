@@ -22,11 +22,13 @@ from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mechanics import MechanicsConfig
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
 
 
+RIGID: Final = MechanicsConfig()  # without play, ripple and flexibility
 FEATURE: Final = "feature"
 SEEN: Final = "seen"
 
@@ -145,6 +147,13 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
         Group("joint_offset", (n,), PARAMETER, "rad", "True joint angle at a reported position of zero."),
         Group("gear_ratio", (n,), PARAMETER, "1", "True joint motion over reported joint motion."),
         *(BALL_PARAMETERS if view is None else view.parameters()),
+        Group("backlash", (n,), PARAMETER, "rad", "Half of the play between gear and joint.", 0.0),
+        Group("ripple", (n,), PARAMETER, "rad", "Amplitude by which the gear leads the joint."),
+        Group("ripple_order", (n,), PARAMETER, "1", "Periods of the ripple in a turn."),
+        Group(
+            "tool_frequency", (1,), PARAMETER, "rad/s", "Natural frequency of a flexible tool; 0 for a rigid one.", 0.0
+        ),
+        Group("tool_damping", (1,), PARAMETER, "1", "Damping ratio of a flexible tool, below 1.", 0.0),
         Group("lag", (n,), PARAMETER, "s", "Time constant of the joint's velocity loop; 0 for none.", 0.0),
         Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
@@ -154,8 +163,12 @@ def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
         Group("joint_velocity_command", (n,), INPUT, "rad/s", "Joint velocity command, held over a step."),
         Group("joint_position", (n,), STATE, "rad", "Reported joint position.", nominal=1.0),
         Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity.", nominal=1.0),
+        Group("tool_deflection", (3,), STATE, "m", "Deflection of the tool in the base frame.", nominal=1.0),
+        Group("tool_velocity", (3,), STATE, "m/s", "Velocity of the target in the base frame.", nominal=1.0),
         Group("der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."),
         Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
+        Group("der(tool_deflection)", (3,), DERIVATIVE, "m/s", "Derivative of the deflection."),
+        Group("der(tool_velocity)", (3,), DERIVATIVE, "m/s2", "Derivative of the velocity."),
         Group("stop_indicator", (n, 2), INDICATOR, "1", "Distance to lower and upper stop; at a stop the command."),
         Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
         *(_ball_outputs(n) if view is None else view.outputs(n)),
@@ -241,6 +254,7 @@ class Actuation:
         home: (..., n) reported joint positions at the start [rad].
         encoder_resolution: step of the encoders [rad], one for all joints or (n,); 0 for exact ones.
         limits: of the arm's maker, which hold as well; None for none.
+        mechanics: gears and tool.
     """
 
     lag: float | FloatArray
@@ -249,6 +263,7 @@ class Actuation:
     home: FloatArray
     encoder_resolution: float | FloatArray = 0.0
     limits: JointLimits | None = None
+    mechanics: MechanicsConfig = RIGID
 
     def stops(self, n: int) -> JointLimits:
         """Return speeds and stops of `n` joints."""
@@ -259,6 +274,7 @@ def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArr
     """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
     arm, n = model.arm, model.arm.n
     stops = actuation.stops(n)
+    mechanics = actuation.mechanics
     columns = {"a": 0, "y": 1, "d": 2}
     angles = {"alpha": 0, "pitch": 1, "yaw": 2}
     return {
@@ -269,6 +285,8 @@ def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArr
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
         **_sensing_parameters(model),
+        **{name: np.full(n, getattr(mechanics, name)) for name in ("backlash", "ripple", "ripple_order")},
+        **{name: np.array([getattr(mechanics, name)]) for name in ("tool_frequency", "tool_damping")},
         "lag": np.array(np.broadcast_to(actuation.lag, n)),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,

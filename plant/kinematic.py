@@ -28,6 +28,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
+from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
 
 
 @settings
@@ -46,6 +47,8 @@ class KinematicConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
+    mechanics: MechanicsConfig = nested(MechanicsConfig)
+    """Backlash and ripple of the gears, and a flexible tool."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
@@ -101,33 +104,43 @@ class KinematicState(NamedTuple):
         q: (..., n), rad.
         v: (..., n), rad/s.
         a: (..., n), rad/s², of joints with overshoot; else 0.
+        x: (..., n), rad, behind the gears.
+        tool: of a flexible tool.
     """
 
     model: RobotModel
     q: FloatArray
     v: FloatArray
     a: FloatArray
+    x: FloatArray
+    tool: Tool
 
 
 class KinematicWorld(World):
-    """A serial arm and its cameras, in closed form: [q, v]₊ = A [q, v] + B u, y = h(q)."""
+    """A serial arm and its cameras, in closed form: [q, v]₊ = A [q, v] + B u, y = h(q), or h(x, δ) with mechanics."""
 
     def __init__(self, config: KinematicConfig, setup: PlantSetup) -> None:
         """Build the world.
 
         Raises:
-            ValueError: a start of the wrong size, or a period that is not positive.
+            ValueError: a start of the wrong size, a period that is not positive, or a flexible tool
+                without a ball.
         """
         model, start = setup.robot()
+        mechanics = self.mechanics = config.mechanics
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
-        rest = np.zeros(start.shape)
-        self.lead, self._first = model.lead, KinematicState(model, start, rest, rest)
-        self._model, self._q, self._v, self._a = self._first
+        rest, none = np.zeros(start.shape), np.zeros((*model.lead, 3))
+        x = mechanics.transmitted(start) if mechanics.geared else start
+        self.lead, self._first = model.lead, KinematicState(model, start, rest, rest, x, Tool(none, none))
+        self._model, self._q, self._v, self._a, self._x, self._tool = self._first
+        self._flexible, self._parts = mechanics.tool_frequency > 0.0, mechanics.parts(setup.period)
+        self._part = setup.period / self._parts
+        mechanics.check(model)
         self._config = config
         self._truth: Truth | None = None
         self._seen: BoolArray | None = None
         self.lag, self.noise_unit = config.lag, model.noise_unit
-        A, B = discretise_lag(config.lag, setup.period)
+        A, B = discretise_lag(config.lag, self._part)
         self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
 
     def reset(self, seed: Seeds) -> FloatArray:
@@ -137,20 +150,35 @@ class KinematicWorld(World):
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
         """Hold a command for one period of the world; see `World.advance`."""
+        after = self._carried() if self._flexible else None
+        for _ in range(self._parts):
+            self._follow(joint_velocity)
+            self._x = self.mechanics.driven(self._x, self._q) if self.mechanics.geared else self._q
+            if after is not None:
+                before, after = after, self._carried()
+                self._tool = self.mechanics.swung(self._tool, before, after, self._part)
+        self._truth = None
+        return self._q
+
+    def _carried(self) -> Motion:
+        """Return the motion of the ball of a rigid tool."""
+        ball, jacobian = self._model.arm.ball_and_jacobian(self._x)
+        return ball, np.matvec(jacobian, self.mechanics.driven_velocity(self._x, self._q, self._v))
+
+    def _follow(self, joint_velocity: FloatArray) -> None:
+        """Move the reported joints under a command (..., n), rad/s, for a part of the period."""
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
         a, swings = self._a, self._config.overshoot > 0.0
         if swings:
-            q, v, a = follow_with_overshoot((self._q, self._v, a), joint_velocity, self._config, self.spec.period)
+            q, v, a = follow_with_overshoot((self._q, self._v, a), joint_velocity, self._config, self._part)
         if not is_finite(q):
             q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
         self._v = np.where(self._q == q, v, 0.0)
         if swings:
             self._a = np.where(self._q == q, a, 0.0)
-        self._truth = None
-        return self._q
 
     def see(self) -> FloatArray:
         """Return the true feature."""
@@ -164,7 +192,11 @@ class KinematicWorld(World):
     def truth(self) -> Truth:
         """Return feature and Jacobian of the true model, computed once a period."""
         if self._truth is None:
-            feature, jacobian, self._seen = self._model.observe(self._q)
+            feature, jacobian, self._seen = self._model.observe(self._x)
+            if self._flexible:
+                feature = feature + np.vecmat(self._tool.deflection, self._model.camera[..., :3, :3])
+            if self.mechanics.ripple > 0.0:
+                jacobian = jacobian * self.mechanics.slope(self._q)[..., None, :]
             self._truth = Truth(feature, jacobian)
         return self._truth
 
@@ -174,11 +206,11 @@ class KinematicWorld(World):
 
     def save(self) -> KinematicState:
         """See `Plant.save`."""
-        return KinematicState(self._model, self._q, self._v, self._a)
+        return KinematicState(self._model, self._q, self._v, self._a, self._x, self._tool)
 
     def restore(self, state: KinematicState) -> None:
         """See `Plant.restore`."""
-        self._model, self._q, self._v, self._a = state
+        self._model, self._q, self._v, self._a, self._x, self._tool = state
         self._truth, self.faults = None, {}
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:

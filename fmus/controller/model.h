@@ -11,7 +11,8 @@
 #include "layout.h"
 #include <stddef.h>
 
-enum { HAS_EXCHANGE = 0, N_STATES = 0, OFFSET_STATES = 0, OFFSET_DERIVATIVES = 0, OFFSET_INDICATORS = 0 };
+enum { HAS_EXCHANGE = 0, N_STATES = 0, N_INDICATORS = 0 };
+enum { OFFSET_STATES = 0, OFFSET_DERIVATIVES = 0, OFFSET_INDICATORS = 0 };
 
 typedef struct {
     double time;

@@ -189,7 +189,7 @@ fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count)
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *count)
 {
     OPEN(~0);
-    *count = N_STATES;
+    *count = N_INDICATORS;
     return fmi3OK;
 }
 

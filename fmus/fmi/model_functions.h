@@ -20,6 +20,8 @@ void model_set_states(Model *model, const double *states);
 
 /* Advances by `step` under the present input. */
 ModelStatus model_step(Model *model, double step);
+/* Notes that a solver completed a step. */
+void model_accept(Model *model);
 /* Handles a state event; says whether states changed. */
 ModelStatus model_settle(Model *model, int *changed);
 /* Writes an event since the last call; zero if there was none (more). */

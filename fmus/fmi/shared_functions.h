@@ -109,6 +109,7 @@ Status FMI(CompletedIntegratorStep)(Handle instance, Boolean no_set_state, Boole
     (void)no_set_state;
     OPEN(CONTINUOUS);
     *enter_event = *terminate = 0;
+    model_accept(&self->core.model);
     return ANSWER(core_check_stop_time(&self->core));
 }
 
@@ -119,20 +120,19 @@ Status FMI(SetTime)(Handle instance, double time)
     return STATUS_OK;
 }
 
-/* There are as many event indicators as states. */
-static const char *check_count(size_t count) { return count == N_STATES ? NULL : "wrong number of values"; }
+static const char *check_count(size_t count, size_t wanted) { return count == wanted ? NULL : "wrong number of values"; }
 
 Status FMI(SetContinuousStates)(Handle instance, const double states[], size_t count)
 {
     OPEN(EXCHANGING);
-    const char *message = check_count(count);
+    const char *message = check_count(count, N_STATES);
     if (message == NULL) model_set_states(&self->core.model, states);
     return ANSWER(message);
 }
 
-static const char *copy_values(Instance *self, size_t offset, double values[], size_t count)
+static const char *copy_values(Instance *self, size_t offset, size_t wanted, double values[], size_t count)
 {
-    const char *message = check_count(count);
+    const char *message = check_count(count, wanted);
     for (size_t i = 0; message == NULL && i < count; i++) core_get(&self->core, offset + i, &values[i]);
     return message;
 }
@@ -140,25 +140,25 @@ static const char *copy_values(Instance *self, size_t offset, double values[], s
 Status FMI(GetContinuousStates)(Handle instance, double states[], size_t count)
 {
     OPEN(READABLE);
-    return ANSWER(copy_values(self, OFFSET_STATES, states, count));
+    return ANSWER(copy_values(self, OFFSET_STATES, N_STATES, states, count));
 }
 
 Status GET_DERIVATIVES(Handle instance, double derivatives[], size_t count)
 {
     OPEN(DERIVATIVE_PHASES);
-    return ANSWER(copy_values(self, OFFSET_DERIVATIVES, derivatives, count));
+    return ANSWER(copy_values(self, OFFSET_DERIVATIVES, N_STATES, derivatives, count));
 }
 
 Status FMI(GetEventIndicators)(Handle instance, double indicators[], size_t count)
 {
     OPEN(READABLE);
-    return ANSWER(copy_values(self, OFFSET_INDICATORS, indicators, count));
+    return ANSWER(copy_values(self, OFFSET_INDICATORS, N_INDICATORS, indicators, count));
 }
 
 Status FMI(GetNominalsOfContinuousStates)(Handle instance, double nominals[], size_t count)
 {
     OPEN(~0);
-    const char *message = check_count(count);
+    const char *message = check_count(count, N_STATES);
     for (size_t i = 0; message == NULL && i < count; i++) nominals[i] = 1.0;
     return ANSWER(message);
 }

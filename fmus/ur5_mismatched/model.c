@@ -9,6 +9,8 @@
 #define MIN_LAG 1e-6
 /* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
 #define STOP_HYSTERESIS 1e-9
+/* Over which play is updated once, and the acceleration of a flexible tool changes linearly, at most [s]. */
+#define LONGEST_PART 0.005
 
 enum { STALE_FEATURE = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
@@ -25,6 +27,12 @@ static double encoder_position(const Model *model, size_t i)
 {
     const double q = model->values[OFFSET_JOINT_POSITION + i], step = model->values[OFFSET_ENCODER_RESOLUTION + i];
     return step > 0.0 ? rint(q / step) * step : q;
+}
+
+static double gear_position(const Model *model, size_t i)
+{
+    const double q = model->values[OFFSET_JOINT_POSITION + i], a = model->values[OFFSET_RIPPLE + i];
+    return q + a * sin(model->values[OFFSET_RIPPLE_ORDER + i] * q);
 }
 
 static double clipped_command(const Model *model, size_t i)
@@ -57,6 +65,32 @@ static int side_met(const Model *model, size_t i)
 
 static int is_driven(const Model *model, size_t i, int side) { return clipped_command(model, i) * side > 0.0; }
 
+/* How far each joint is from its gear, within the play. */
+static void find_play(const Model *model, double play[N_JOINTS])
+{
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const double gear = gear_position(model, i), most = model->values[OFFSET_BACKLASH + i], x = model->driven[i];
+        play[i] = x <= gear - most ? -most : x >= gear + most ? most : x - gear;
+    }
+}
+
+void model_accept(Model *model)
+{
+    double play[N_JOINTS];
+    find_play(model, play);
+    for (size_t i = 0; i < N_JOINTS; i++) model->driven[i] = gear_position(model, i) + play[i];
+}
+
+/* Place and velocity of the target of a rigid tool, and the derivatives of the tool's states; each may be NULL. */
+static void find_motion(const Model *model, double motion[6], double rates[6])
+{
+    double work[N_WORK], play[N_JOINTS];
+    find_play(model, play);
+    const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
+    double *results[2] = {motion, rates};
+    arm_motion(arguments, results, NULL, work, 0);
+}
+
 const char *model_explain(ModelStatus status)
 {
     switch (status) {
@@ -86,7 +120,9 @@ void model_start(Model *model)
         model->values[OFFSET_JOINT_POSITION + i] = model->values[OFFSET_HOME + i];
         model->values[OFFSET_JOINT_VELOCITY + i] = 0.0;
         model->held[i] = 0;
+        model->driven[i] = gear_position(model, i);
     }
+    memset(model->values + OFFSET_TOOL_DEFLECTION, 0, 6 * sizeof(double));
     model->stale = STALE_ALL;
 }
 
@@ -123,6 +159,7 @@ ModelStatus model_settle(Model *model, int *changed)
         }
         model->held[i] = is_driven(model, i, side) ? side : 0;
     }
+    model_accept(model);
     model->stale = STALE_ALL;
     return MODEL_OK;
 }
@@ -174,8 +211,9 @@ ModelStatus model_set(Model *model, size_t index, double value)
 
 static void refresh_kinematics(Model *model, int part)
 {
-    double work[N_WORK];
-    const double *arguments[2] = {model->values + OFFSET_JOINT_POSITION, model->values};
+    double work[N_WORK], play[N_JOINTS];
+    find_play(model, play);
+    const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
     if (part == STALE_FEATURE) {
         double *results[1] = {model->values + OFFSET_FEATURE};
         arm_feature(arguments, results, NULL, work, 0);
@@ -199,6 +237,7 @@ static void refresh_derivatives(Model *model)
         indicators[0] = held < 0 ? -u : lower_room(model, i) + STOP_HYSTERESIS;
         indicators[1] = held > 0 ? u : upper_room(model, i) + STOP_HYSTERESIS;
     }
+    find_motion(model, NULL, model->values + OFFSET_DER_TOOL_DEFLECTION);
     model->stale &= ~STALE_DERIVATIVES;
 }
 
@@ -224,7 +263,7 @@ ModelStatus model_get(Model *model, size_t index, double *value)
 
 void model_set_states(Model *model, const double *states)
 {
-    memcpy(model->values + OFFSET_JOINT_POSITION, states, sizeof(double) * 2 * N_JOINTS);
+    memcpy(model->values + OFFSET_STATES, states, sizeof(double) * N_STATES);
     model->stale = STALE_ALL;
 }
 
@@ -241,20 +280,63 @@ static void refresh_gains(Model *model, double step)
     model->gain_step = step;
 }
 
-ModelStatus model_step(Model *model, double step)
+static ModelStatus move_joints(Model *model)
 {
     double *position = model->values + OFFSET_JOINT_POSITION, *velocity = model->values + OFFSET_JOINT_VELOCITY;
-    if (step != model->gain_step) { /* also after a parameter was set */
-        const ModelStatus status = model_check(model);
-        if (status != MODEL_OK) return status;
-        refresh_gains(model, step);
-    }
     for (size_t i = 0; i < N_JOINTS; i++) {
         const double u = clipped_command(model, i), v = velocity[i];
         const double q = position[i] + model->drift[i] * v + model->push[i] * u;
         if (!isfinite(q)) return MODEL_NOT_FINITE;
         position[i] = clip(q, model->values[OFFSET_JOINT_LOWER + i], model->values[OFFSET_JOINT_UPPER + i]);
         velocity[i] = position[i] == q ? model->decay[i] * v + (1.0 - model->decay[i]) * u : 0.0;
+    }
+    model_accept(model);
+    return MODEL_OK;
+}
+
+/* The tool a step later, in closed form: the velocity of a rigid one is a parabola with the right distance. */
+static void swing_tool(Model *model, double step, const double before[6], const double after[6])
+{
+    double *deflection = model->values + OFFSET_TOOL_DEFLECTION, *velocity = model->values + OFFSET_TOOL_VELOCITY;
+    const double omega = model->values[OFFSET_TOOL_FREQUENCY], sigma = model->values[OFFSET_TOOL_DAMPING] * omega;
+    const double square = omega * omega, damped = sqrt(square - sigma * sigma), left = exp(-sigma * step);
+    const double c = cos(damped * step), s = sin(damped * step) / damped;
+    for (size_t k = 0; k < 3; k++) {
+        const double from = before[3 + k], to = after[3 + k];
+        const double bend = 3.0 * (from + to) - 6.0 * (after[k] - before[k]) / step;
+        const double drift = -2.0 * bend / (step * step * square);
+        const double centre = (from - to + bend) / (step * square) - 2.0 * sigma * drift / square;
+        const double d = deflection[k] - centre, r = velocity[k] - from - drift;
+        deflection[k] = centre + drift * step + left * ((c + sigma * s) * d + s * r);
+        velocity[k] = to + drift + left * ((c - sigma * s) * r - square * s * d);
+    }
+}
+
+static double count_parts(const Model *model, double step)
+{
+    int whole = model->values[OFFSET_TOOL_FREQUENCY] == 0.0;
+    for (size_t i = 0; i < N_JOINTS; i++) whole &= model->values[OFFSET_BACKLASH + i] == 0.0;
+    return whole ? 1.0 : fmax(1.0, ceil(step / LONGEST_PART - 1e-9));
+}
+
+ModelStatus model_step(Model *model, double step)
+{
+    const double parts = count_parts(model, step), part = step / parts;
+    const int flexible = model->values[OFFSET_TOOL_FREQUENCY] > 0.0;
+    double before[6], after[6];
+    if (part != model->gain_step) { /* also after a parameter was set */
+        const ModelStatus status = model_check(model);
+        if (status != MODEL_OK) return status;
+        refresh_gains(model, part);
+    }
+    if (flexible) find_motion(model, after, NULL);
+    for (double done = 0.0; done < parts; done += 1.0) {
+        const ModelStatus status = move_joints(model);
+        if (status != MODEL_OK) return status;
+        if (!flexible) continue;
+        memcpy(before, after, sizeof before);
+        find_motion(model, after, NULL);
+        swing_tool(model, part, before, after);
     }
     model->stale = STALE_ALL;
     return MODEL_OK;
@@ -281,7 +363,7 @@ ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
     hold(model);
     if (starting) {
         memcpy(direction + OFFSET_JOINT_POSITION, direction + OFFSET_HOME, N_JOINTS * sizeof(double));
-        memset(direction + OFFSET_JOINT_VELOCITY, 0, N_JOINTS * sizeof(double));
+        memset(direction + OFFSET_JOINT_VELOCITY, 0, (N_STATES - N_JOINTS) * sizeof(double));
     }
     for (size_t i = 0; i < N_JOINTS; i++) {
         const int held = model->held[i];
@@ -293,10 +375,11 @@ ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
         indicators[0] = held < 0 ? -du : dq - direction[OFFSET_JOINT_LOWER + i];
         indicators[1] = held > 0 ? du : direction[OFFSET_JOINT_UPPER + i] - dq;
     }
-    double work[N_WORK];
-    const double *arguments[4] = {model->values + OFFSET_JOINT_POSITION, model->values,
-                                  direction + OFFSET_JOINT_POSITION, direction};
-    double *results[1] = {direction + OFFSET_FEATURE}; /* the Jacobian follows it */
+    double work[N_WORK], play[N_JOINTS];
+    find_play(model, play);
+    const double *arguments[5] = {model->values + OFFSET_STATES, model->values, play,
+                                  direction + OFFSET_STATES, direction};
+    double *results[2] = {direction + OFFSET_FEATURE, direction + OFFSET_DER_TOOL_DEFLECTION}; /* the Jacobian follows */
     arm_forward(arguments, results, NULL, work, 0);
     return MODEL_OK;
 }

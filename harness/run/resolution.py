@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from servobench.harness.config.registry import (
@@ -123,6 +123,10 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
             controller or task does not have; a value out of its bounds; or one setting in both.
     """
     of_sensor = request.mismatch.plant_settings
+    mechanical = [key for key in of_sensor if key.startswith("mechanics.")]
+    if mechanical and "mechanics" not in {field.name for field in fields(sections[request.plant])}:
+        known = "gears and tools are those of kinematic and fmu"
+        raise ConfigurationError(f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}")
     plant = request.varied_in("plant")
     for key, _ in plant:
         if key in of_sensor:

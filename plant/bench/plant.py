@@ -22,6 +22,7 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -38,6 +39,7 @@ class TrueModel:
         command_delay: between a command and its first effect, s.
         lag: time constant of the joints' velocity loops, s; None where it is unknown.
         latency_spread: by which a frame may be later than the latency, s.
+        camera_turn: with which the first camera turns about its optical axis, rad/s.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
@@ -46,6 +48,7 @@ class TrueModel:
     command_delay: float = 0.0
     lag: float | None = None
     latency_spread: float = 0.0
+    camera_turn: float = 0.0
 
 
 class Abilities(ABC):
@@ -246,6 +249,9 @@ class World(Abilities):
         if not self.lead:
             raise fault
         self.faults = {lane: fault, **self.faults}
+
+    mechanics: MechanicsConfig = MechanicsConfig()
+    """Gears and tool."""
 
     noise_unit: float = 1.0
     """A metre of noise in the unit of the features."""

@@ -5,8 +5,8 @@ magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20m
 `camera_move=90deg`; of cameras in pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
 `mount=5deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file (`factory=FILE`;
 without a file, that of one real UR5).
-Words for the sensor (`outliers=40%`; see `plant.contract.sensing`) stand among the axes; they change settings of
-the plant and draw no robot.
+Words for the sensor (`outliers=40%`; see `plant.contract.sensing`) and for gears and tool (`backlash=2deg`; see
+`plant.robot.mechanics`) stand among the axes; they change settings of the plant and draw no robot.
 
 Links, joint offsets, gear ratios and the three components of the tool offset are each drawn uniformly from plus or
 minus the magnitude. The camera turns about an axis drawn at random; by an angle drawn from plus or minus the
@@ -35,6 +35,7 @@ from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE,
 from servobench.plant.contract.settings import nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
+from servobench.plant.robot.mechanics import MECHANICS_AXES
 from servobench.plant.robot.robot import Robot
 
 MAX_TILT = radians(45.0)
@@ -76,7 +77,7 @@ class Mismatch:
             if [name for name, _ in self.axes].count(axis) > 1:
                 raise ValueError(f"mismatch {str(self)!r} has the axis {axis} twice; give it once")
             size = magnitude.size(axis)
-            if axis in SENSOR_AXES:
+            if axis in SENSOR_AXES or axis in MECHANICS_AXES:
                 continue
             if AXES[axis][0] is SHARE:
                 check_number(axis, size, at_least=0.0, below=1.0)
@@ -126,13 +127,17 @@ class Mismatch:
 
     @cached_property
     def plant_settings(self) -> dict[str, float | str]:
-        """Settings of the plant that the axes of the sensor stand for, by dotted key.
+        """Settings of the plant that the axes of sensor, gears and tool stand for, by dotted key.
 
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
         axes = [(axis, magnitude.size(axis)) for axis, magnitude in self.axes if axis in SENSOR_AXES]
-        return {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
+        own = {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
+        mechanical = {
+            MECHANICS_AXES[axis].setting: each.size(axis) for axis, each in self.axes if axis in MECHANICS_AXES
+        }
+        return own | {f"mechanics.{name}": value for name, value in mechanical.items()}
 
     @property
     def camera_exact(self) -> bool:
@@ -302,7 +307,7 @@ AXES = {
     "centre": (PIXELS, "10px"),
     "distortion": (SHARE, "10%"),
     "mount": (ANGLE, "5deg"),
-    **{name: (axis.units, axis.example) for name, axis in SENSOR_AXES.items()},
+    **{name: (axis.units, axis.example) for name, axis in {**SENSOR_AXES, **MECHANICS_AXES}.items()},
 }
 RANGES = {
     "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "px": "0:20:5px", "ms": "0:200:50ms", "": "1:2:0.5",

@@ -4,6 +4,7 @@ from dataclasses import replace
 import casadi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from kit.plants import nominal_ur5
 from kit.toy import plant_spec
@@ -153,6 +154,21 @@ def test_frames_that_are_late_by_unknown_times_within_known_bounds_disturb_no_mo
     unaware, _ = commands(TARGET, disturb=lambda k: k * k % 3, image=True)
     assert np.abs(unaware - alone).max() > 1e-3
     np.testing.assert_allclose(exposure_ages(Delays(0.1, 0.0, 0.0, 0.05), 0.05), 2.0 + 0.25 * np.arange(8))
+
+
+def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
+    def seen(joints, time):
+        return Rotation.from_rotvec([0.0, 0.0, -0.3 * time]).apply(np.array(MODEL.feature(joints)))
+
+    for image in (True, False):
+        controller = NmpcCalibrated(NmpcCalibratedConfig(image=image), replace(knowledge(), true_camera_turn=0.3))
+        joints, errors = START, []
+        for k in range(60):
+            feature = seen(joints, 0.05 * k)
+            command = controller.step(Observation(0.05 * k, joints, feature), hold(TARGET))
+            joints = joints + 0.05 * command.joint_velocity
+            errors.append(np.linalg.norm(seen(joints, 0.05 * (k + 1)) - TARGET))
+        assert (max(errors[40:]) < 1e-3) == image
 
 
 def test_a_lost_frame_leaves_the_offset_as_it_is():

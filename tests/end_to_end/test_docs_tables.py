@@ -27,6 +27,7 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.fmu.world import FmuConfig
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
 PACKAGE = "servobench"
@@ -38,7 +39,7 @@ def config_classes():
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     tasks = [type(entry.default) for entry in TASKS.values()]
-    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings, SensingConfig]
+    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings, SensingConfig, MechanicsConfig]
     return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 

@@ -55,6 +55,22 @@ def test_an_integrated_fmu_agrees_with_its_co_simulation_also_at_stops(version, 
         world.close()
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_integrated_fmu_has_the_play_and_the_tool_of_its_co_simulation(version, tmp_path):
+    path = without_co_simulation(version, tmp_path / "exchange.fmu")
+    mechanics = {"backlash": np.full(6, 0.035), "ripple": np.full(6, 0.03), "ripple_order": np.full(6, 8.0)}
+    mechanics |= {"tool_frequency": np.array([12.0]), "tool_damping": np.array([0.02])}
+    files = path, cached_fmu(version)
+    # Play is updated at completed steps of the integrator.
+    worlds = [FmuWorld(FmuMapping(each, **NAMES, parameters=mechanics, period=0.005), None, 0.05) for each in files]
+    for k in range(40):
+        for world in worlds:
+            world.advance(np.linspace(0.4, 1.0, 6) * (1.0 if k < 15 else -1.0))
+        np.testing.assert_allclose(*(world.see() for world in worlds), rtol=0, atol=2e-5)
+    for world in worlds:
+        world.close()
+
+
 def test_what_an_fmu_refuses_within_the_solver_is_told(tmp_path):
     description = re.sub(r"<CoSimulation[^>]*/>", "", describe_exchange())
     path = build_crane(tmp_path / "crane.fmu", 2, description=description)

@@ -227,7 +227,7 @@ def test_information_tells_version_platform_and_variables(version):
     for capabilities in information.interfaces.values():
         assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
         assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
-    assert len(described.modelVariables) == (171 if version == 2 else 30)
+    assert len(described.modelVariables) == (203 if version == 2 else 39)
     assert all(variable.unit and variable.description for variable in described.modelVariables) or version == 2
 
 

@@ -187,6 +187,32 @@ def test_derivatives_by_parameters_equal_differences(parameter):
             np.testing.assert_allclose(came[:, k], column, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    "known", ["a", "gear_ratio", "joint_velocity_command", "ripple", "ripple_order", "tool_frequency", "tool_damping"]
+)
+def test_derivatives_by_parameters_of_gears_and_tool_equal_differences(known):
+    play = 0.0 if "ripple" in known else 0.02  # a gear that comes back leaves the joint where it is
+    values = {"backlash": np.full(6, play), "ripple": np.full(6, 0.03), "ripple_order": np.full(6, 7.0)}
+    values |= {"tool_frequency": np.array([12.0]), "tool_damping": np.array([0.05])}
+    commands = np.array([0.5, -0.4, 0.3, 0.1, -0.2, 0.3])
+    with Opened(2, start=False) as opened:
+        for name, value in values.items():
+            opened.set(name, value)
+        opened.instance.start(0.0)
+        opened.set("joint_velocity_command", commands)
+        opened.instance.stepper(0.3)(0.0)
+        value = opened.get(known).copy()
+        for unknown in ("ball_position", "jacobian", "der(tool_deflection)", "der(tool_velocity)"):
+            came = opened.derivative(unknown, known)
+            for k in range(value.size):
+                column = 0.0
+                for sign in (1.0, -1.0):
+                    opened.set(known, value + sign * 1e-6 * np.eye(value.size)[k])
+                    column += sign * opened.get(unknown).copy() / 2e-6
+                opened.set(known, value)
+                np.testing.assert_allclose(came[:, k], column, rtol=1e-6, atol=1e-7, err_msg=f"{unknown} by {known}")
+
+
 def run(plant, count: int, seed: int) -> list[bytes]:
     generator = np.random.default_rng(seed)
     rows = [plant.step(Command(generator.uniform(-1.0, 1.0, 6))) for _ in range(count)]

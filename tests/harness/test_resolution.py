@@ -98,8 +98,9 @@ def knowledge_of(plant, needs_truth, settings, **request):
 def test_a_bound_knows_the_delays_of_its_plant(plant):
     assert knowledge_of(plant, True, LATE).true_delays == Delays(0.1, 0.02, 0.03)
     assert knowledge_of(plant, True, LATE, latency=0.2, period=0.02).true_delays == Delays(0.2, 0.02, 0.03)
-    late = knowledge_of(plant, True, LATE | {"sensing": {"jitter": 0.1}}).true_delays
-    assert late == Delays(0.0, 0.02, 0.03, latency_spread=0.1)
+    known = knowledge_of(plant, True, LATE | {"sensing": {"jitter": 0.1, "latency_swing": 0.1, "camera_turn": 0.2}})
+    assert known.true_delays == Delays(0.0, 0.02, 0.03, latency_spread=pytest.approx(0.3))
+    assert known.true_camera_turn == 0.2
 
 
 def test_a_competitor_does_not():

@@ -103,9 +103,11 @@ def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     n, layout = model.arm.n, arm_layout(model.arm.n)
     q, values = casadi.SX.sym("q", n), parameters_of(model, Actuation(0.05, 1.0, 2 * np.pi, np.zeros(n)))
     p = casadi.DM(np.concatenate([np.ravel(values[group.name]) for group in layout.kinematic]))
-    exported_feature, exported_jacobian, _ = core_functions(layout)
+    exported_feature, exported_jacobian, *_ = core_functions(layout)
     feature = symbolic_feature(model)(q)
-    outputs = [feature, casadi.jacobian(feature, q), exported_feature(q, p)[:3], exported_jacobian(q, p)]
+    states, play = casadi.vertcat(q, casadi.DM.zeros(n + 6)), casadi.DM.zeros(n)
+    exported = exported_feature(states, p, play)[:3], exported_jacobian(states, p, play)
+    outputs = [feature, casadi.jacobian(feature, q), *exported]
     function = casadi.Function("all", [q], outputs)
     for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, n)):
         y, J, exported_y, exported_J = (np.asarray(value) for value in function(pose))
