@@ -50,7 +50,10 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
          "controllers/test_mpc_closed_form.py", "controllers/test_mpc_optimality.py"),
     ),
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
-    "statistics": (("harness/analysis/statistics.py",), ("harness/test_statistics.py",)),
+    "statistics": (
+        ("harness/analysis/statistics.py", "harness/analysis/scores.py"),
+        ("harness/test_statistics.py", "harness/test_scores.py"),
+    ),
     "results": (
         ("harness/batch/results.py", "harness/batch/tables.py"),
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
