@@ -154,7 +154,7 @@ class NmpcCalibrated(Controller):
         if self._config.image:
             self._observe(observation, feature)
         start = present + self._to_come @ self._sent
-        places = np.arange(len(reference)) * self._spec.period
+        places: FloatArray = self._spec.period * np.arange(float(len(reference)))
         rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
