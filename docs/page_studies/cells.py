@@ -7,20 +7,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
 import pandas as pd
 
 from page_studies.study import ENGINES
 from servobench.harness.analysis.comparison import (
-    Comparison,
+    CURVE,
+    achieved_share,
     column_of,
     compare_pairs,
-    differences_of_pairs,
     outcomes,
     settled_share,
     settling_times,
 )
-from servobench.harness.analysis.statistics import MISSING, Estimate, median_with_interval, success_rate, tail_mean
+from servobench.harness.analysis.statistics import (
+    MISSING,
+    Difference,
+    Estimate,
+    mean_with_interval,
+    median_with_interval,
+    tail_mean,
+)
 from servobench.harness.run.result import COMPLETED
 
 TAIL: Final = 0.95
@@ -71,8 +77,13 @@ def share(runs: pd.DataFrame) -> str:
 
 
 def millimetres(runs: pd.DataFrame, column: str = "rms_error_evaluated", digits: int = 1) -> str:
-    """Return the median of a column of errors with its interval [mm]; a run that did not complete counts as ∞."""
-    return short(median_with_interval(1000.0 * column_of(runs, column).where(runs["status"] == COMPLETED)), digits)
+    """Return the median of a column of errors with its interval [mm]; a run that did not complete counts as ∞.
+
+    Of a curve that not all runs followed, the share of lost runs is told, too.
+    """
+    middle = short(median_with_interval(1000.0 * column_of(runs, column).where(runs["status"] == COMPLETED)), digits)
+    lost = 100.0 - achieved_share(runs).value
+    return f"{middle}, {lost:.0f} % lost" if lost and (runs["task_kind"] == CURVE).all() else middle
 
 
 def worst_errors(runs: pd.DataFrame) -> str:
@@ -110,26 +121,24 @@ class Measure:
     Attributes:
         task: whose runs are compared.
         metric: the column that is compared, less is better.
-        never: what a run counts as that has no value or did not complete.
         digits: after the point.
         factor: to the unit that is shown.
     """
 
     task: str
     metric: str
-    never: float
     digits: int
     factor: float
 
-    def compare(self, runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> list[Comparison]:
+    def compare(self, runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> list[Difference]:
         """Return the paired difference of each pair of names."""
         own, keys = runs[runs["task"] == self.task], ("plant", "task", "seed")
-        return compare_pairs(own, pairs, never=self.never, metric=self.metric, keys=keys)
+        return compare_pairs(own, pairs, metric=self.metric, keys=keys)
 
-    def difference(self, comparison: Comparison) -> str:
-        """Return a paired difference with its interval, and in brackets the p-value after Holm's correction."""
-        value = comparison.difference.scaled(self.factor)
-        return f"{value:+.{self.digits}f} (p {comparison.corrected_p_value:.1g})"
+    def difference(self, found: Difference) -> str:
+        """Return the lost runs of both if there are any, the mean difference with its interval, and the verdict."""
+        lost = "{} : {} lost, ".format(*found.lost) if any(found.lost) else ""
+        return f"{lost}{found.mean.scaled(self.factor):+.{self.digits}f} {found.verdict}"
 
     def on_engines(
         self, runs: Mapping[str, pd.DataFrame], pairs: Sequence[tuple[str, str]]
@@ -137,28 +146,28 @@ class Measure:
         """Yield for each pair its difference on each engine, in bold on both where it holds on one only.
 
         That is where the interval of one lies above or below 0, that of the other does not lie on the same side, and
-        the difference differs between the engines, robot by robot: the interval of its median lies above or below 0.
+        the difference differs between the engines, robot by robot: the interval of its mean lies above or below 0.
         """
         compared = [self.compare(runs[engine], pairs) for engine in ENGINES]
         for pair, *found in zip(pairs, *compared, strict=True):
             one, other = (self._by_robot(runs[engine], pair) for engine in ENGINES)
-            between = median_with_interval(np.asarray(differences_of_pairs(*one.align(other, join="inner"))))
+            between = mean_with_interval((one - other).dropna().to_numpy())
             cells = {engine: self.difference(each) for engine, each in zip(ENGINES, found, strict=True)}
-            on_one_only = len({side(each.difference) for each in found}) > 1 and side(between) != 0
+            on_one_only = len({side(each.mean) for each in found}) > 1 and side(between) != 0
             yield {engine: marked(cell) for engine, cell in cells.items()} if on_one_only else cells
 
     def _by_robot(self, runs: pd.DataFrame, pair: tuple[str, str]) -> pd.Series[float]:
         """Return the difference of two names for each seed."""
         own = runs[runs["task"] == self.task]
-        values = column_of(own, self.metric).where(own["status"] == COMPLETED).fillna(self.never)
+        values = column_of(own, self.metric).where(own["status"] == COMPLETED)
         first, second = (
             values[own["controller"] == name].set_axis(own.loc[own["controller"] == name, "seed"]) for name in pair
         )
-        return differences_of_pairs(*first.align(second, join="inner"))
+        return first - second
 
 
-MOVES: Final = Measure("random", "settling_time_s", never=10.0, digits=2, factor=1.0)  # 10 s is the whole move
-CIRCLES: Final = Measure("circle", "rms_error_evaluated", never=1.0, digits=1, factor=1e3)  # [m], shown in mm
+MOVES: Final = Measure("random", "settling_time_s", digits=2, factor=1.0)
+CIRCLES: Final = Measure("circle", "rms_error_evaluated", digits=1, factor=1e3)  # [m], shown in mm
 
 
 def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame, name: str) -> pd.DataFrame:
@@ -170,8 +179,3 @@ def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame, name: str) -> 
 def side(estimate: Estimate) -> int:
     """Return 1 or −1 where the interval lies above or below 0, and 0 where it does not."""
     return int(estimate.low > 0.0) - int(estimate.high < 0.0)
-
-
-def most(count: int, other: int) -> bool:
-    """Return whether `count` is more than half of both beyond the Wilson interval."""
-    return count > 0 and success_rate(count, count + other).low > 0.5

@@ -83,11 +83,13 @@ def tables(folder: Path) -> dict[str, pd.DataFrame]:
     both = pd.concat([load_runs(folder / part) for part in HELD_OUT.commands], ignore_index=True)
     pair_rows = [
         {
-            "pair": f"{cells.quoted(move.first)} − {cells.quoted(move.second)}",
+            "pair": f"{cells.quoted(pair[0])} − {cells.quoted(pair[1])}",
             "settling time, s": cells.MOVES.difference(move),
             "circle, mm": cells.CIRCLES.difference(circle),
         }
-        for move, circle in zip(*(each.compare(both, PAIRS) for each in (cells.MOVES, cells.CIRCLES)), strict=True)
+        for pair, move, circle in zip(
+            PAIRS, *(each.compare(both, PAIRS) for each in (cells.MOVES, cells.CIRCLES)), strict=True
+        )
     ]
     return {
         "headline": pd.DataFrame(headline_rows(both)),

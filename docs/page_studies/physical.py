@@ -13,8 +13,8 @@ import pandas as pd
 
 from page_studies import cells
 from page_studies.study import BOTH, ENGINES, RENDERED, Study, Words, on_engines, settings, sweep
-from servobench.harness.analysis.comparison import column_of, settling_times
-from servobench.harness.analysis.statistics import MISSING, median_with_interval
+from servobench.harness.analysis.comparison import column_of, margin, settling_times
+from servobench.harness.analysis.statistics import MISSING, is_majority, median_with_interval
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.result import COMPLETED
 
@@ -54,20 +54,20 @@ def count_and_median(runs: pd.DataFrame) -> str:
 
 
 def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
-    """Return in which way runs are worse at a faster rate beyond the paired 95 % interval; empty if in none.
+    """Return in which way runs are worse at a faster rate; empty if in none.
 
-    Settled shares differ where, of the robots that settle at one rate only, more than half are those of the slower one,
-    lower end of the Wilson interval; times differ where the interval of the median of their differences is above 0.
+    Settled shares differ where a sign test says so of the robots that settle at one rate only; times differ where the
+    interval of their mean difference is above the slower period.
     """
     settles = [set(runs.loc[settling_times(runs).notna(), "seed"]) for runs in (slow, fast)]
     lost, won = len(settles[0] - settles[1]), len(settles[1] - settles[0])
     words = []
-    if cells.most(lost, won):
+    if is_majority(lost, won):
         words.append(f"{lost} fewer settle, {won} more")
     named = pd.concat([slow.assign(controller="slow"), fast.assign(controller="fast")])
     later = cells.MOVES.compare(named, [("fast", "slow")])[0]
-    if later.difference.low > 0.0:
-        words.append(f"{cells.MOVES.difference(later)} s")
+    if later.mean.low > margin("settling_time_s", named):
+        words.append(f"{later.mean:+.2f} s")
     return ", ".join(words)
 
 

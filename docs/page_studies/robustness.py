@@ -7,10 +7,11 @@ from pathlib import Path
 import pandas as pd
 from PIL import Image
 
-from page_studies.cells import by_method, marked, most, quoted
+from page_studies.cells import by_method, marked, quoted
 from page_studies.pictures import small
 from page_studies.study import ENGINES, FOUR, SUFFIX, Study, Words, on_engines
 from servobench.harness.analysis.comparison import settling_times
+from servobench.harness.analysis.statistics import is_majority
 from servobench.harness.batch.results import load_runs
 from servobench.harness.studies.robustness import KNOWN_LINES
 
@@ -50,7 +51,7 @@ def settled_at_places(runs: pd.DataFrame) -> list[str]:
     ]
     only = [int((one & ~other).to_numpy().sum()) for one, other in (found, found[::-1])]
     cells = [" ".join(str(count) for count in each.sum()) for each in found]
-    return [marked(cell) for cell in cells] if most(*only) or most(*only[::-1]) else cells
+    return [marked(cell) for cell in cells] if is_majority(*only) or is_majority(*only[::-1]) else cells
 
 
 MAP = Study(

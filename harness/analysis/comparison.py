@@ -1,62 +1,38 @@
 """The table of runs read: how runs ended, which of them are compared, and paired differences between controllers.
 
-A run without a settling time counts differently in each function:
-
-| function | a run that never settled |
-|---|---|
-| `settled_share` | is not settled |
-| `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
-| `outcomes` | has the outcome of the table, such as `not_settled` or `target_unreachable` |
-
-A run that did not complete never settled, even if its error was small before: see `settling_times`.
+A run that did not complete never settled, even if its error was small before: see `settling_times`. In a comparison a
+run without a value is lost, see `servobench.harness.analysis.statistics.paired_difference`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.statistics import (
+    Difference,
     Estimate,
-    holm,
-    median_with_interval,
-    signed_rank_p_value,
+    paired_difference,
     success_rate,
 )
+from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
-from servobench.harness.run.request import varied_columns
+from servobench.harness.run.request import RunSettings, varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
 CONDITION: Final = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
 HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
+ERROR_MARGIN: Final = 0.04  # of the settling band: 0.2 mm of 5 mm
+BOUND_MARGIN: Final = 0.1  # of the error of a controller that knows the robot
+SHARE_MARGIN: Final = 0.01
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Two controllers on the same plants, tasks and seeds.
-
-    Attributes:
-        first: name of a controller.
-        second: name of the other.
-        difference: median of first − second over pairs; below 0 the first one is better.
-        p_value: two-sided, of the Wilcoxon signed-rank test.
-        corrected_p_value: after Holm, over all comparisons made together.
-    """
-
-    first: str
-    second: str
-    difference: Estimate
-    p_value: float
-    corrected_p_value: float
 
 
 def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -191,55 +167,66 @@ def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
     return f"{factor * handy * float(band):.3g} {name}"
 
 
+def margin(name: str, runs: pd.DataFrame) -> float:
+    """Return the difference in a metric of runs of one place that does not matter, in the unit of its column.
+
+    For a time that is one control period; for an error 0.2 mm, as a share of the settling band, or a tenth of the
+    median of the best controller that knows the robot if that is more; for a share or ratio 0.01; else 0.
+    """
+    unit = METRICS[name].unit if name in METRICS else None
+    if unit == "s":
+        return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
+    if unit:
+        return SHARE_MARGIN if unit == "1" else 0.0
+    if unit is None:
+        return 0.0
+    bounds = runs[runs["controller"].isin([each for each in runs["controller"].unique() if knows_truth(str(each))])]
+    best = column_of(bounds, name).groupby(bounds["controller"]).median().min()
+    return float(np.nan_to_num(np.fmax(ERROR_MARGIN * column_of(runs, "settling_band").max(), BOUND_MARGIN * best)))
+
+
+def knows_truth(name: str) -> bool:
+    """Return whether a controller of this package needs the true robot; a third party's is not loaded for this."""
+    if name not in CONTROLLERS and "+" not in name:
+        return False
+    try:
+        return find_controller(name).needs_truth
+    except ConfigurationError:
+        return False
+
+
 def compare_pairs(
     runs: pd.DataFrame,
     pairs: Sequence[tuple[str, str]],
     *,
-    never: float,
     metric: str = "settling_time_s",
     keys: Sequence[str] = KEYS,
-) -> list[Comparison]:
-    """Compare controllers on the runs that they share, and correct for the number of comparisons.
-
-    Wilcoxon's signed-rank test, two-sided, and Holm's correction over all `pairs`; see `signed_rank_p_value`. Settling
-    times are whole periods, so equal ones are frequent.
+) -> list[Difference]:
+    """Compare controllers on the runs of one place that they share.
 
     Args:
         runs: the table of runs.
         pairs: names of controllers, two and two.
-        never: the value of a run that has none or did not complete; for settling times the duration [s].
-        metric: the column compared, less is better.
+        metric: the column compared, less is better; a run that has no value or did not complete is lost.
         keys: columns that two runs of a pair share.
 
     Raises:
-        ValueError: no pair, two controllers without a common run, or two runs of a controller with the same keys.
+        ValueError: two controllers without a common run, or two runs of a controller with the same keys.
     """
-    if not pairs:
-        raise ValueError("pairs must hold at least one pair of controllers")
-    differences = [_differences(runs, pair, never, metric, keys) for pair in pairs]
-    p_values = [signed_rank_p_value(difference) for difference in differences]
-    corrected = holm(p_values)
-    return [
-        Comparison(*pair, median_with_interval(difference), p_value, corrected_p_value)
-        for pair, difference, p_value, corrected_p_value in zip(pairs, differences, p_values, corrected, strict=True)
-    ]
+    small = margin(metric, runs)
+    return [paired_difference(*_paired_values(runs, pair, metric, keys), small) for pair in pairs]
 
 
-def differences_of_pairs(first: pd.Series[float], second: pd.Series[float]) -> pd.Series[float]:
-    """Return `first` − `second`, rounded to 10⁻¹² of the unit: equal times, as sums of periods, may differ by less."""
-    return (first - second).round(12)
-
-
-def _differences(
-    runs: pd.DataFrame, pair: tuple[str, str], never: float, metric: str, keys: Sequence[str]
-) -> FloatArray:
-    values = column_of(runs, metric).where(runs["status"] == COMPLETED).fillna(never)
+def _paired_values(
+    runs: pd.DataFrame, pair: tuple[str, str], metric: str, keys: Sequence[str]
+) -> tuple[pd.Series[float], pd.Series[float]]:
+    values = column_of(runs, metric).where(runs["status"] == COMPLETED)
     indexed = pd.Series(values.to_numpy(), index=pd.MultiIndex.from_frame(runs[list(keys)]))
     first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
     for name, series in zip(pair, (first, second), strict=True):
         if series.index.has_duplicates:
             raise ValueError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
-    first, second = first.align(second, join="inner")
-    if len(first) == 0:
+    common = first.index.intersection(second.index, sort=False)
+    if len(common) == 0:
         raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")
-    return np.asarray(differences_of_pairs(first, second), dtype=np.float64)
+    return first[common], second[common]

@@ -1,13 +1,14 @@
-"""How sure a number is: rates, medians and tails with intervals, and tests of paired differences.
+"""How sure a number is: rates, medians and tails with intervals, and verdicts on paired differences.
 
 All functions are pure. In `median_with_interval` and `tail_mean` a missing value counts as +∞ unless it is left out: so
-does a median where half of the values or more are missing. Intervals hold 95 %.
+does a median where half of the values or more are missing. Intervals hold 95 %, those of mean differences 90 %.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Final, Literal
 
 import numpy as np
@@ -16,6 +17,10 @@ from numpy.typing import ArrayLike
 from servobench.plant.contract.checks import FloatArray
 
 CONFIDENCE: Final = 0.95
+ALPHA: Final = 0.05  # of each one-sided test
+MIN_PAIRS: Final = 6  # least number of equal signs that a two-sided sign test distinguishes from chance at 5 %
+LOST_MARGIN: Final = 0.03  # difference in the share of lost runs up to which methods may be equivalent
+Verdict = Literal["better", "equivalent", "worse", "undecided"]
 RESAMPLES: Final = 2000
 MISSING: Final = "–"  # text for a number that there is not
 
@@ -60,19 +65,82 @@ class Estimate:
 NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
 
 
+@dataclass(frozen=True)
+class Difference:
+    """How a first method differs from a second one on the same robots, in a measure of which less is better.
+
+    Attributes:
+        mean: of first − second over the robots on which neither is lost, with Student's interval of 90 %.
+        probability: P(first < second) + P(equal)/2 on a robot, where a lost run is worse than any other.
+        lost: number of lost runs of the first and of the second.
+        verdict: on the first.
+    """
+
+    mean: Estimate
+    probability: Estimate
+    lost: tuple[int, int]
+    verdict: Verdict
+
+
+def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Difference:
+    """Compare two methods robot by robot.
+
+    Where a sign test over the robots that only one of them loses shows a difference, fewer lost runs are better. Else
+    two one-sided t-tests decide (Schuirmann, 1987): better or worse where the interval of the mean lies beyond the
+    margin, equivalent where it lies within and the shares of lost runs differ by at most `LOST_MARGIN`. All else is
+    undecided, as are fewer than `MIN_PAIRS` robots.
+
+    Args:
+        first: values by robot, less is better; NaN or +∞ is a lost run.
+        second: likewise, of the same robots.
+        margin: difference that does not matter.
+    """
+    one, other = _sample(first), _sample(second)
+    with np.errstate(invalid="ignore"):
+        difference = np.round(one - other, 12)  # ±∞ where one is lost, NaN where both are
+    count, sign = len(difference), np.where(np.isnan(difference), 0.0, np.sign(difference))
+    mean = mean_with_interval(difference[np.isfinite(difference)])
+    more, fewer = (int(np.count_nonzero(each)) for each in (difference == np.inf, difference == -np.inf))
+    verdict: Verdict = "undecided"
+    if is_majority(more, fewer) or is_majority(fewer, more):
+        verdict = "worse" if more > fewer else "better"
+    elif mean.count >= MIN_PAIRS and (mean.low > margin or mean.high < -margin):
+        verdict = "worse" if mean.value > 0.0 else "better"
+    elif mean.count >= MIN_PAIRS and max(-mean.low, mean.high) <= margin:
+        verdict = "equivalent" if abs(more - fewer) <= LOST_MARGIN * count else "undecided"
+    lost = int(np.isinf(one).sum()), int(np.isinf(other).sum())
+    return Difference(mean, _wilson(0.5 - 0.5 * float(sign.sum()) / max(count, 1), count), lost, verdict)
+
+
+def is_majority(ones: int, others: int) -> bool:
+    """Return whether a one-sided sign test at 5 % shows `ones` to be more frequent; of few, nothing is shown."""
+    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
+
+    with np.errstate(under="ignore"):
+        return ones + others >= MIN_PAIRS and stats.binomtest(ones, ones + others, alternative="greater").pvalue < ALPHA
+
+
+def mean_with_interval(values: FloatArray) -> Estimate:
+    """Return the mean of finite values with Student's interval of 90 %; none of fewer than two values."""
+    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
+
+    count = len(values)
+    if count < 2:
+        return Estimate(float(values.sum()), np.nan, np.nan, count) if count else NO_ESTIMATE
+    mean, error = float(values.mean()), float(values.std(ddof=1)) / count**0.5
+    reach = float(stats.t.ppf(1.0 - ALPHA, count - 1)) * error
+    return Estimate(mean, mean - reach, mean + reach, count)
+
+
 def success_rate(successes: int, runs: int) -> Estimate:
     """Return the share of successes with its Wilson interval.
 
     Raises:
         ValueError: no run, or more successes than runs.
     """
-    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
-
     if not 0 <= successes <= runs or runs < 1:
         raise ValueError(f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}")
-    with np.errstate(under="ignore"):  # scipy also takes a p-value, however small
-        interval = stats.binomtest(successes, runs).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / runs, float(interval.low), float(interval.high), runs)
+    return _wilson(successes / runs, runs)
 
 
 def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "left_out"] = "infinite") -> Estimate:
@@ -141,18 +209,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(value) for value in corrected]
 
 
-def signed_rank_p_value(differences: ArrayLike) -> float:
-    """Return the two-sided p-value of Wilcoxon's signed-rank test with Pratt's zeros; 1 where all are zero.
-
-    Differences below a billionth of the largest count as zero and equal ones as ties: 0.3 − 0.1 and 0.2 are no ranks.
-    """
-    from scipy import stats  # noqa: PLC0415 - as above
-
-    difference = np.asarray(differences, dtype=np.float64)
-    largest = float(np.abs(difference).max())
-    if largest == 0.0:
-        return 1.0
-    return float(stats.wilcoxon(np.round(difference / largest, 9), zero_method="pratt").pvalue)
+def _wilson(share: float, count: int) -> Estimate:
+    """Return a share with its Wilson interval; of a share with ties as halves it is wider than need be."""
+    if count == 0:
+        return NO_ESTIMATE
+    z = NormalDist().inv_cdf((1.0 + CONFIDENCE) / 2.0)
+    centre, reach = share + z * z / (2.0 * count), z * (share * (1.0 - share) / count + (0.5 * z / count) ** 2) ** 0.5
+    low, high = ((centre + side * reach) / (1.0 + z * z / count) for side in (-1.0, 1.0))
+    return Estimate(share, max(low, 0.0), min(high, 1.0), count)
 
 
 def _sample(values: ArrayLike) -> FloatArray:

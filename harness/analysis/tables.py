@@ -24,6 +24,7 @@ from servobench.harness.analysis.comparison import (
     column_of,
     compare_pairs,
     in_handy_units,
+    margin,
     metric_heading,
     outcomes,
     settling_band,
@@ -43,7 +44,7 @@ from servobench.harness.analysis.statistics import (
     success_rate,
     tail_mean,
 )
-from servobench.harness.analysis.verdict import scores
+from servobench.harness.analysis.verdict import judged_metric, judged_values
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import (
     ACHIEVED,
@@ -107,20 +108,19 @@ def as_plain(rows: list[Row]) -> list[dict[str, object]]:
     return [{name: cell.plain() for name, cell in row.items()} for row in rows]
 
 
-def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
+def statistics_tables(runs: pd.DataFrame, metric: str | None = None) -> Tables:
     """Yield for each plant, task and condition how each controller does, and how each pair of them differs."""
-    for words, controllers, pairs in statistics_rows(runs, metric, never):
+    for words, controllers, pairs in statistics_rows(runs, metric):
         yield words, as_text(controllers)
         if pairs:
-            yield "pairs", as_text(pairs)
+            table = as_text(pairs)
+            yield f"pairs, verdicts with a margin of {table.pop('margin')[0]}", table
 
 
-def statistics_rows(
-    runs: pd.DataFrame, metric: str | None = None, never: float | None = None
-) -> Iterator[tuple[str, list[Row], list[Row]]]:
+def statistics_rows(runs: pd.DataFrame, metric: str | None = None) -> Iterator[tuple[str, list[Row], list[Row]]]:
     """Yield for each plant, task and condition its words, a row for each controller and one for each pair of them."""
     for words, place in split_conditions(runs):
-        yield words, _controller_rows(place), _pair_rows(place, metric, never)
+        yield words, _controller_rows(place), _pair_rows(place, metric)
 
 
 def _controller_rows(runs: pd.DataFrame) -> list[Row]:
@@ -145,31 +145,30 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
     return rows
 
 
-def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> list[Row]:
+def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     pairs = list(combinations(dict.fromkeys(runs["controller"]), 2))
     if not pairs:
         return []
     if metric is None:
-        metric = "rms_error_evaluated" if len(split_tasks(runs)[1]) else "settling_time_s"
+        metric = judged_metric(runs)
     numbers = [str(name) for name in runs.select_dtypes("number").columns]
     if metric not in numbers:
         raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
-    if never is None:
-        known = runs[metric].dropna()
-        never = 2.0 * float(known.max()) if len(known) else 1.0
-    compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
+    compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
     label, (unit, factor) = metric.replace("_", " "), ("1", 1.0)
     if metric in METRICS:
         label, (unit, factor) = METRICS[metric].label, shown_unit(metric, runs)
-    difference = f"difference in {label}" if unit == "1" else f"difference in {label}, {unit}"
+    difference = f"mean difference in {label}" if unit == "1" else f"mean difference in {label}, {unit}"
     return [
         {
-            "pair": Cell(f"{pair.first} − {pair.second}"),
-            "pairs": Cell(pair.difference.count),
-            difference: Cell(pair.difference.scaled(factor), ".2f"),
-            "p after Holm": Cell(pair.corrected_p_value, ".2g"),
+            "pair": Cell(f"{first} − {second}"),
+            "lost": Cell("{} : {}".format(*each.lost)),
+            difference: Cell(each.mean.scaled(factor), ".2f"),
+            "verdict": Cell(each.verdict),
+            "P(better)": Cell(each.probability, ".2f"),
+            "margin": Cell(f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")),
         }
-        for pair in compared
+        for (first, second), each in zip(pairs, compared, strict=True)
     ]
 
 
@@ -315,7 +314,8 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             own = place[place["controller"] == name]
             where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
             row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
-            table, unit, digits = scores(place)
+            table, metric = judged_values(place), judged_metric(place)
+            unit, digits = shown_unit(metric, place)[0], METRICS[metric].digits
             heading = f"after [{unit}]" if unit == "s" else f"RMS error [{unit}]"
             row[where, heading] = (
                 f"{median_with_interval(table[name]):.{digits}f}" if name in table and len(table) else MISSING

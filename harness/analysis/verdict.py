@@ -1,15 +1,15 @@
 """The result of a results folder in a sentence or two, and the leading controller in each place.
 
-Two controllers count as different where a paired signed-rank test over seeds, corrected for all pairs after Holm, stays
-below 5 %. A seed counts once, however many tasks it was run on: runs of one seed share a robot. Controllers that know
-the true robot are bounds and are not ranked.
+In one place controllers are told apart by the verdict on their paired difference, see
+`servobench.harness.analysis.statistics.paired_difference`, success rates by a sign test over seeds: a seed counts once,
+however many tasks it was run on, as runs of one seed share a robot. Controllers that know the true robot are bounds and
+are not ranked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
@@ -18,18 +18,18 @@ import pandas as pd
 from servobench.harness.analysis.comparison import (
     achieved_share,
     column_of,
+    knows_truth,
+    margin,
     outcomes,
     settling_times,
     shown_unit,
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.statistics import holm, median_with_interval, signed_rank_p_value
-from servobench.harness.config.registry import CONTROLLERS, find_controller
+from servobench.harness.analysis.statistics import MIN_PAIRS, is_majority, median_with_interval, paired_difference
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
-from servobench.plant.contract.faults import ConfigurationError
 
 LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"
@@ -62,23 +62,13 @@ def judge(runs: pd.DataFrame) -> Verdict:
     chosen = runs[runs["controller"].isin(ranked)]
     if len(ranked) == 1:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
-    return Verdict(_of_several(chosen), (_doubts(chosen), *cautions))
+    return Verdict(_of_several(chosen, runs), (_doubts(chosen, runs), *cautions))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
     """Return the controllers that do not know the true robot; all where there is no other."""
     names = list(dict.fromkeys(runs["controller"].astype(str)))
     return [name for name in names if not knows_truth(name)] or names
-
-
-def knows_truth(name: str) -> bool:
-    """Return whether a controller of this package needs the true robot; a third party's is not loaded for this."""
-    if name not in CONTROLLERS and "+" not in name:
-        return False
-    try:
-        return find_controller(name).needs_truth
-    except ConfigurationError:
-        return False
 
 
 def asked_of(runs: pd.DataFrame) -> str:
@@ -89,55 +79,32 @@ def asked_of(runs: pd.DataFrame) -> str:
     )
 
 
-def leaders(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the leading controller of each plant, task and condition with its evidence; empty without a competition.
+def leaders(runs: pd.DataFrame, names: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return the leading one of some controllers in each plant, task and condition with its evidence.
 
-    First is the controller with the highest success rate, then the one that has the smallest median settling time, on
-    a curve the smallest median error.
+    Without names, of all that do not know the true robot. Empty without a competition. First is the controller with the
+    highest success rate, then the one that has the smallest median settling time, on a curve the smallest median error.
     """
-    places = split_conditions(runs[runs["controller"].isin(ranked_controllers(runs))])
-    if len(places) > MOST_PLACES:
-        return pd.DataFrame()
-    rows = [_leader(words, place) for words, place in places if place["controller"].nunique() > 1]
-    return pd.DataFrame(rows)
+    names = ranked_controllers(runs) if names is None else names
+    competitions = [
+        (words, place, own)
+        for words, place in split_conditions(runs)
+        if (own := place[place["controller"].isin(names)])["controller"].nunique() > 1
+    ]
+    return pd.DataFrame([_leader(*each) for each in competitions] if len(competitions) <= MOST_PLACES else [])
 
 
-def seeds_needed(controllers: int) -> int:
-    """Return the least number of seeds with which the test can distinguish two of so many controllers."""
-    pairs = controllers * (controllers - 1) // 2
-    return 1 + int(np.ceil(np.log2(pairs / LEVEL)))
+def judged_metric(place: pd.DataFrame) -> str:
+    """Return the column by which the runs of a place are compared."""
+    return "rms_error_evaluated" if len(split_tasks(place)[1]) else "settling_time_s"
 
 
-def scores(place: pd.DataFrame) -> tuple[pd.DataFrame, str, int]:
-    """Return the scores of a place, seeds × controllers, with their unit and digits; infinite where a run failed.
-
-    That is the settling time of a move, and the error of the judged part of a curve.
-    """
-    if len(split_tasks(place)[1]):
-        unit, factor = shown_unit("rms_error_evaluated", place)
-        values = factor * column_of(place, "rms_error_evaluated").where(place["status"] == COMPLETED)
-        digits = METRICS["rms_error_evaluated"].digits
-    else:
-        values, unit, digits = settling_times(place), "s", METRICS["settling_time_s"].digits
-    table = place.assign(score=values.fillna(np.inf))
-    return table.pivot_table(index="seed", columns="controller", values="score", sort=False), unit, digits
-
-
-def shown_smaller(table: pd.DataFrame) -> set[tuple[str, str]]:
-    """Return the pairs of columns of which the first is shown to be smaller; an infinite value is larger than any."""
-    known = table.dropna()
-    finite = known.to_numpy()[np.isfinite(known.to_numpy())]
-    known = known.replace(np.inf, 2.0 * float(finite.max(initial=0.5)))
-    pairs = list(combinations([str(name) for name in known.columns], 2))
-    if known.empty or not pairs:
-        return set()
-    differences = {(a, b): known[a] - known[b] for a, b in pairs}
-    corrected = holm([signed_rank_p_value(difference) for difference in differences.values()])
-    return {
-        (a, b) if (np.sign(difference) * difference.abs().rank()).sum() < 0.0 else (b, a)  # the sum of signed ranks
-        for ((a, b), difference), p_value in zip(differences.items(), corrected, strict=True)
-        if p_value < LEVEL
-    }
+def judged_values(place: pd.DataFrame) -> pd.DataFrame:
+    """Return the judged metric in the unit in which it is shown, seeds × controllers; infinite where a run is lost."""
+    metric = judged_metric(place)
+    values = shown_unit(metric, place)[1] * column_of(place, metric).where(place["status"] == COMPLETED)
+    table = place.assign(value=values.fillna(np.inf))
+    return table.pivot_table(index="seed", columns="controller", values="value", sort=False)
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:
@@ -166,7 +133,8 @@ def _of_one_controller(runs: pd.DataFrame) -> str:
     return sentence + "."
 
 
-def _of_several(runs: pd.DataFrame) -> str:
+def _of_several(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
+    """Return the result of the runs of ranked controllers; those `beside` include bounds, which set margins."""
     shares = _shares(runs)
     asked, most, least = asked_of(runs), max(shares.values()), min(shares.values())
     best = [name for name, share in shares.items() if share == most]
@@ -175,16 +143,16 @@ def _of_several(runs: pd.DataFrame) -> str:
     if most == least:
         everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
-        return f"{everyone} {asked} in {often}{_speed(runs, best)}."
+        return f"{everyone} {asked} in {often}{_speed(beside, best)}."
     worst = [name for name, share in shares.items() if share == least]
     first, last = (_share(runs[runs["controller"] == names[0]]) for names in (best, worst))
-    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}{_speed(runs, best)}"
+    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}{_speed(beside, best)}"
     return f"{top}; least often {_listed(worst)}, in {last}."
 
 
 def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
     """Return which of equally reliable controllers is shown to be better than each other one of them."""
-    table = leaders(runs[runs["controller"].isin(names)]) if len(names) > 1 else pd.DataFrame()
+    table = leaders(runs, names) if len(names) > 1 else pd.DataFrame()
     if table.empty:
         return ""
     clear = table["First", "controller"][table["How sure", RIVALS] == NOBODY]
@@ -196,56 +164,64 @@ def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
     return f", of which `{best}` is shown to be the best{where}"
 
 
-def _doubts(runs: pd.DataFrame) -> str:
+def _doubts(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
     """Return how far the order of controllers can be trusted."""
     seeds, count = runs["seed"].nunique(), runs["controller"].nunique()
-    needed = seeds_needed(count)
-    if seeds < needed:
+    if seeds < MIN_PAIRS:
         had = "One seed is" if seeds == 1 else f"{seeds} seeds are"
         which = "the two" if count == 2 else f"any two of {count}"
         return (
             f"{had} too few to tell {which} controllers apart with a paired test "
-            f"(it takes at least {needed}): the order is a hint, not a finding."
+            f"(it takes at least {MIN_PAIRS}): the order is a hint, not a finding."
         )
     achieved = runs.assign(score=outcomes(runs).isin(ACHIEVED).astype(float))
     table = achieved.pivot_table(index="seed", columns="controller", values="score", sort=False)
     best = max((shares := _shares(runs)), key=lambda name: shares[name])
-    less = shown_smaller(table)
-    apart = [name for name in shares if (name, best) in less]
+    ahead = {name: table[best] - table[name] for name in shares}
+    apart = [name for name, each in ahead.items() if is_majority(int((each > 0.0).sum()), int((each < 0.0).sum()))]
     if not apart:
         sentence = "In how often they did so, no controller can be told apart from the first"
         alone = list(shares.values()).count(shares[best]) == 1
-        faster = _faster(runs, best) if alone else []
+        faster = _faster(beside, best, list(shares)) if alone else []
         tail = f", and {_listed(faster)} {_verb(faster, 'is', 'are')} shown to be {BETTER}" if faster else ""
         return f"{sentence}{tail}."
     others = count - 1 - len(apart)
     return f"Told apart from the first: {_listed(apart, 6)}" + (f"; not so the other {others}." if others else ".")
 
 
-def _faster(runs: pd.DataFrame, best: str) -> list[str]:
-    """Return the controllers that are shown to be faster or more precise than `best` in every place."""
+def _faster(runs: pd.DataFrame, best: str, names: Sequence[str]) -> list[str]:
+    """Return which of some controllers are shown to be faster or more precise than `best` in every place."""
     places = split_conditions(runs)
     if len(places) > MOST_PLACES:
         return []
-    smaller = [{name for name, other in shown_smaller(scores(place)[0]) if other == best} for _, place in places]
-    return [name for name in _shares(runs) if all(name in each for each in smaller)]
+    found = [_verdicts(place, [(name, best) for name in names]) for _, place in places]
+    return [name for name, told in zip(names, zip(*found, strict=True), strict=True) if set(told) == {"better"}]
 
 
-def _leader(words: str, place: pd.DataFrame) -> dict[tuple[str, str], Any]:
-    table, unit, digits = scores(place)
-    shares = _shares(place)
-    order = sorted(table.columns, key=lambda name: (-shares[name], table[name].median()))
+def _verdicts(place: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Return how the first of each pair does beside the second in a place, on the seeds that both have run."""
+    table, metric = judged_values(place), judged_metric(place)
+    table = table.reindex(columns=sorted({name for pair in pairs for name in pair}))
+    known, small = [table[list(pair)].dropna() for pair in pairs], shown_unit(metric, place)[1] * margin(metric, place)
+    return [paired_difference(each.iloc[:, 0], each.iloc[:, 1], small).verdict for each in known]
+
+
+def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
+    table, metric, shares = judged_values(place), judged_metric(place), _shares(own)
+    unit, _ = shown_unit(metric, place)
+    order = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
     first, second = order[:2]
-    smaller = shown_smaller(table)
-    rivals = [name for name in order[1:] if (first, name) not in smaller]
+    told = _verdicts(place, [(first, name) for name in order[1:]])
+    rivals = [name for name, verdict in zip(order[1:], told, strict=True) if verdict != "better"]
 
     def median(name: str) -> str:
-        value, *interval = f"{median_with_interval(table[name].to_numpy()):.{digits}f}".split(" ", 1)
-        return " ".join([value, unit, *interval])
+        value, *interval = f"{median_with_interval(table[name]):.{METRICS[metric].digits}f}".split(" ", 1)
+        lost = f"({100.0 * (1.0 - shares[name]):.0f} % lost)" if shares[name] < 1.0 else ""
+        return " ".join([value, unit, *interval, lost]).rstrip()
 
     return {
         ("", "where"): words,
-        ("", "seeds"): str(len(table)),
+        ("", "seeds"): str(own["seed"].nunique()),
         ("First", "controller"): first,
         ("First", "median"): median(first),
         ("Next", "controller"): second,

@@ -31,14 +31,10 @@ def statistics(
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
-    never: Annotated[
-        float | None,
-        option("NUMBER", "Value for a run that has none, such as one that never settled; default: twice the largest."),
-    ] = None,
     markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge the controllers of a folder, with 95 % intervals.
+    """Judge the controllers of a folder, with intervals.
 
     Rates, medians, tails, failures and paired differences.
     """
@@ -54,13 +50,13 @@ def statistics(
         print_json(
             [
                 {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
-                for place, controllers, pairs in statistics_rows(runs, metric, never)
+                for place, controllers, pairs in statistics_rows(runs, metric)
             ]
         )
         return
     if missing:
         say(missing)
-    tables = statistics_tables(runs, metric, never)
+    tables = statistics_tables(runs, metric)
     print_markdown(tables) if markdown else print_tables(tables)
 
 

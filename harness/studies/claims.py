@@ -4,17 +4,17 @@ The rules, fixed before the runs were made:
 
 | claim | reproduced where |
 |---|---|
-| 1 faster | the paired settling time difference is below 0 (p < 0.05 after Holm) in all 12 pairings of move and rival |
-| 2 overshoot, path | both are larger than the rival's in all 12 pairings, in the same sense |
-| 3 alike | in all tasks the interval of the paired difference in settling time lies within ±10 % of the median |
-| 4 leaving the region | it costs both RBF methods more time than it costs `ukf_mfac`, and the proposed one most |
+| 1 faster | the verdict on the paired difference in settling time is *better* in all 12 pairings of move and rival |
+| 2 overshoot, path | those on both are *worse*, that is larger than the rival's, in all 12 pairings |
+| 3 alike | that on settling times is *equivalent* in all moves |
+| 4 leaving the region | its cost in time is *worse* for both RBF methods than for `ukf_mfac`, worst for the proposed |
 | 5 circle | the second lap stays within 10 mm RMS in more than 80 % of robots, lower end of the interval |
 | 6 cheaper | its median step is shorter than that of `ukf_mpc` by a factor of 2, in the moves and on the circle |
-| 7 keeps up | learning online lowers the mean Jacobian error (p < 0.05 after Holm) in all five tasks |
+| 7 keeps up | the mean Jacobian error is *better* with learning online than without in all five tasks |
 
-A rule that holds in none of its cases is *not reproduced*, one that holds in some *depends on* them. A case of so few
-robots that the rule could not hold in any event decides nothing. A run that never settles counts as its whole
-duration.
+A rule that holds in none of its cases is *not reproduced*, one that holds in some *depends on* them. A case that is
+*undecided* needs more robots. Verdicts, margins and lost runs are those of `servobench.harness.analysis.statistics` and
+`comparison`; in claim 4 a run that never settles counts as its whole duration.
 """
 
 from __future__ import annotations
@@ -24,17 +24,15 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.analysis.comparison import differences_of_pairs, settling_times
+from servobench.harness.analysis.comparison import margin, settling_times
 from servobench.harness.analysis.statistics import (
-    NO_ESTIMATE,
     Estimate,
-    holm,
+    Verdict,
     median_with_interval,
-    signed_rank_p_value,
+    paired_difference,
     success_rate,
 )
 from servobench.harness.batch.campaign import Campaign
@@ -43,12 +41,10 @@ from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
 
-ALIKE_SHARE: Final = 0.10  # of the median settling time
 CLEAR_RATIO: Final = 2.0  # of step times, so large that every machine shows it
 MAX_CIRCLE_ERROR: Final = 0.010  # [m]
 MIN_CIRCLE_SHARE: Final = 0.8
 Tables = Mapping[str, pd.DataFrame]
-LEVEL: Final = 0.05
 DURATION: Final = 10.0  # [s] of a move
 REPRODUCED, NOT_REPRODUCED, DEPENDS = "reproduced", "not reproduced", "depends"
 UNDECIDED: Final = "too few robots to tell"
@@ -87,8 +83,8 @@ class Measurement:
         place: task.
         label: controller, reading or pairing.
         estimate: value and interval.
-        holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are so
-            few that it could not hold in any event.
+        holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are too
+            few to tell.
     """
 
     panel: str
@@ -180,8 +176,8 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
 
 
 def _faster(tables: Tables, plant: str) -> Answer:
-    panel = "settling time, proposed − rival, s"
-    compared = pairings(tables[MAIN], "settling_time_s", panel, sign=-1, never=DURATION)
+    panel = "settling time, proposed − rival, mean, s"
+    compared = pairings(tables[MAIN], "settling_time_s", panel, "better")
     middles = medians(tables[MAIN], "settling time, median, s")
     words = "; ".join(
         f"{task} " + ", ".join(f"{m.label} {_seconds(m.estimate.value)}" for m in middles if m.place == task)
@@ -198,20 +194,16 @@ def _seconds(median: float) -> str:
 
 def _overshoot_and_path(tables: Tables, plant: str) -> Answer:
     runs = tables[MAIN]
-    over = pairings(runs, "overshoot", "overshoot, proposed − rival, %", sign=1, factor=100.0)
-    path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival", sign=1)
+    over = pairings(runs, "overshoot", "overshoot, proposed − rival, mean, %", "worse", 100.0)
+    path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival, mean", "worse")
     evidence = f"larger overshoot in {held(over)} of {len(over)} pairings, longer path in {held(path)} of {len(path)}"
     return answer("2", "its overshoot is larger and its path longer", plant, [*over, *path], evidence)
 
 
 def _alike(tables: Tables, plant: str) -> Answer:
-    measured = []
-    for task in MOVES:
-        times = by_seed(tables[MAIN], task, "settling_time_s", DURATION)
-        difference = median_with_interval(differences_of_pairs(times["ukf_mpc"], times["ukf_mfac"]).dropna())
-        inside = max(abs(difference.low), abs(difference.high)) <= ALIKE_SHARE * float(times["ukf_mfac"].median())
-        panel = "settling time, ukf_mpc − ukf_mfac, s"
-        measured.append(Measurement(panel, task, "ukf_mpc − ukf_mfac", difference, inside))
+    panel, small = "settling time, ukf_mpc − ukf_mfac, mean, s", margin("settling_time_s", tables[MAIN])
+    times = {task: by_seed(tables[MAIN], task, "settling_time_s")[["ukf_mpc", "ukf_mfac"]] for task in MOVES}
+    measured = [judged(panel, task, own, small, "equivalent") for task, own in times.items()]
     laps = [circle_error(tables[MAIN], name) for name in ("ukf_mfac", "ukf_mpc")]
     differences = ", ".join(f"{m.place} {m.estimate:.2f} s" for m in measured)
     circle = " against ".join(f"{m.estimate:.1f} mm ({m.label})" for m in laps)
@@ -225,12 +217,8 @@ def _leaving(tables: Tables, plant: str) -> Answer:
     )
     cost = leaving - staying  # [s] by seed and controller
     pairs = ((PROPOSED, "ukf_mfac"), ("rbf_pid", "ukf_mfac"), (PROPOSED, "rbf_pid"))
-    differences = [differences_of_pairs(cost[first], cost[second]).dropna() for first, second in pairs]
-    panel = "extra settling time where the region is left, s"
-    measured = []
-    for (first, second), difference, clear in zip(pairs, differences, significant(differences), strict=True):
-        middle = median_with_interval(difference)
-        measured.append(Measurement(panel, "exp1, exp4", f"{first} − {second}", middle, clear and middle.value > 0.0))
+    panel, small = "extra settling time where the region is left, mean, s", margin("settling_time_s", runs)
+    measured = [judged(panel, "exp1, exp4", cost[list(pair)].dropna(), small, "worse") for pair in pairs]
     evidence = "; ".join(f"{m.label} {m.estimate:.2f} s" for m in measured)
     return answer("4", "outside the region both RBF methods suffer, the proposed more", plant, measured, evidence)
 
@@ -273,13 +261,11 @@ def _keeps_up(tables: Tables, plant: str) -> Answer:
         for table in (tables[MAIN], tables[FROZEN])
     )
     both = pd.DataFrame({"online": online, "frozen": frozen}).dropna()
-    tasks = (*MOVES, CIRCLE)
-    differences = [differences_of_pairs(both.loc[task]["online"], both.loc[task]["frozen"]) for task in tasks]
+    small, panel = margin("jacobian_error_mean", tables[MAIN]), "Jacobian error, online − as trained, mean, %"
     measured, levels, words = [], [], []
-    for task, difference, clear in zip(tasks, differences, significant(differences), strict=True):
-        middle = median_with_interval(100.0 * difference)
-        holds = clear and middle.value < 0.0
-        measured.append(Measurement("Jacobian error, online − as trained, %", task, PROPOSED, middle, holds))
+    for task in (*MOVES, CIRCLE):
+        own = judged(panel, task, 100.0 * both.loc[[task]], 100.0 * small, "better")
+        measured.append(replace(own, label=PROPOSED))
         level = {name: median_with_interval(100.0 * both.loc[task][name]) for name in ("online", "frozen")}
         levels += [Measurement("Jacobian error, mean of a run, %", task, name, level[name]) for name in level]
         words.append(f"{task} {level['online'].value:.1f} / {level['frozen'].value:.1f} %")
@@ -302,62 +288,44 @@ def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) 
             lap,
         ]
         words.append(f"{kind}: settled {100 * share.value:.0f} %, median {time:.2f} s, circle {lap.estimate:.1f} mm")
-        settled.append(times.fillna(DURATION))
-    difference = differences_of_pairs(settled[1], settled[0])
-    verdict = "worse" if difference.mean() > 0.0 else "better"
-    if signed_rank_p_value(difference.to_numpy()) >= LEVEL:
-        verdict = "makes no difference"
-    return Answer(label, statement, plant, verdict, "; ".join(words), tuple(measured))
+        settled.append(times)
+    found = paired_difference(*settled[1].align(settled[0], join="inner"), margin("settling_time_s", usual))
+    words.append(f"mean difference {found.mean:+.2f} s, lost {found.lost[0]} : {found.lost[1]}")
+    return Answer(label, statement, plant, found.verdict, "; ".join(words), tuple(measured))
 
 
-def significant(differences: Sequence[pd.Series[float]]) -> list[bool | None]:
-    """Return for each sample of paired differences whether Wilcoxon's test rejects 0, after Holm over all of them.
-
-    None where not even differences of one sign would be rejected: their two-sided p-value is 2/2ⁿ with n pairs.
-    """
-    p_values = [signed_rank_p_value(values.to_numpy()) if len(values) else 1.0 for values in differences]
-    return [
-        p_value < LEVEL if 2.0 ** (1 - len(values)) < LEVEL else None
-        for p_value, values in zip(holm(p_values), differences, strict=True)
-    ]
+def judged(panel: str, place: str, pair: pd.DataFrame, small: float, wanted: Verdict) -> Measurement:
+    """Return the mean difference of two columns of robots, which a rule wants to be better, worse or equivalent."""
+    found = paired_difference(pair.iloc[:, 0], pair.iloc[:, 1], small)
+    holds = None if found.verdict == "undecided" else found.verdict == wanted
+    return Measurement(panel, place, " − ".join(pair.columns), found.mean, holds)
 
 
-def pairings(
-    runs: pd.DataFrame, metric: str, panel: str, *, sign: int, never: float = np.nan, factor: float = 1.0
-) -> list[Measurement]:
+def pairings(runs: pd.DataFrame, metric: str, panel: str, wanted: Verdict, factor: float = 1.0) -> list[Measurement]:
     """Compare the proposed method with each rival in each move.
 
     Args:
         runs: the table of runs.
         metric: column.
         panel: the measured quantity with its unit.
-        sign: −1 where the claim says less, +1 where it says more.
-        never: replaces a missing value; NaN leaves the pair out.
+        wanted: verdict; with `worse`, larger, a lost run leaves its pair out instead of being worse than any.
         factor: from the column's unit to the panel's.
     """
-    tables = {task: by_seed(runs, task, metric, never) for task in MOVES}
-    found = {
-        (task, rival): differences_of_pairs(table[PROPOSED], table[rival]).dropna() * factor
-        for task, table in tables.items()
-        for rival in OTHERS
-    }
-    return [
-        Measurement(
-            panel,
-            task,
-            rival,
-            median_with_interval(difference) if len(difference) else NO_ESTIMATE,
-            clear and sign * difference.mean() > 0.0,
-        )
-        for ((task, rival), difference), clear in zip(found.items(), significant(list(found.values())), strict=True)
-    ]
+    small, found = factor * margin(metric, runs), []
+    for task in MOVES:
+        values = factor * by_seed(runs, task, metric)
+        for rival in OTHERS:
+            pair = values[[PROPOSED, rival]]
+            measured = judged(panel, task, pair.dropna() if wanted == "worse" else pair, small, wanted)
+            found.append(replace(measured, label=rival))
+    return found
 
 
-def by_seed(runs: pd.DataFrame, task: str, metric: str, never: float) -> pd.DataFrame:
-    """Return `metric` by seed and controller; `never` where a run has none or did not complete."""
+def by_seed(runs: pd.DataFrame, task: str, metric: str) -> pd.DataFrame:
+    """Return `metric` by seed and controller; NaN where a run has none or did not complete."""
     own = runs[runs["task"] == task]
-    values = own[metric].where(own["status"] == COMPLETED).fillna(never)
-    return own.assign(value=values).pivot(index="seed", columns="controller", values="value")
+    own = own.assign(value=own[metric].where(own["status"] == COMPLETED))
+    return own.pivot(index="seed", columns="controller", values="value")
 
 
 def medians(runs: pd.DataFrame, panel: str) -> list[Measurement]:

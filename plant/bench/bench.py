@@ -29,6 +29,7 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import BoolArray, Command, Observation, Truth, trusted_observation
 from servobench.plant.contract.timing import Timing, common_step
+from servobench.plant.robot.mechanics import RippledJacobian
 
 
 class Frame(NamedTuple):
@@ -273,7 +274,11 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        sensing = self._sensing
+        sensing, mechanics, symbolic = self._sensing, self.world.mechanics, model.symbolic
+        if mechanics.ripple > 0.0:
+            a, k = mechanics.ripple, mechanics.ripple_order
+            jacobian = RippledJacobian(model.jacobian, mechanics)
+            model = replace(model, jacobian=jacobian, symbolic=lambda q: symbolic(q + a * (k * q).sin()))
         return replace(
             model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
             latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,

@@ -10,6 +10,8 @@ base frame. Gravity is left out: the ball rests at δ = 0. Play is exact where q
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -98,6 +100,19 @@ class MechanicsConfig:
         """
         if self.tool_frequency > 0.0 and model.channel is not FEATURE:
             raise ValueError("mechanics.tool_frequency needs --sensing position; leave it at 0 with other sensing")
+
+
+@dataclass(frozen=True, eq=False)
+class RippledJacobian:
+    """A Jacobian by reported joint positions, of one by the joints behind gears without play."""
+
+    function: Callable[[FloatArray], FloatArray]
+    mechanics: MechanicsConfig
+
+    def __call__(self, joint_position: FloatArray) -> FloatArray:
+        """Return J(g(q)) ∂g/∂q, (..., m, n), at (..., n) rad."""
+        own = self.mechanics.slope(joint_position)[..., None, :]
+        return self.function(self.mechanics.transmitted(joint_position)) * own
 
 
 MECHANICS_AXES: Final = {

@@ -10,16 +10,19 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
+from statsmodels.stats.weightstats import ttost_paired
 
 from servobench.harness.analysis import statistics
-from servobench.harness.analysis.comparison import Comparison, compare_pairs, outcomes, settling_times
+from servobench.harness.analysis.comparison import compare_pairs, margin, outcomes, settling_times
 from servobench.harness.analysis.statistics import (
     NO_ESTIMATE,
     Estimate,
     holm,
+    is_majority,
+    mean_with_interval,
     median_with_interval,
     number,
-    signed_rank_p_value,
+    paired_difference,
     success_rate,
     tail_mean,
 )
@@ -149,32 +152,13 @@ def test_the_tail_mean_of_hundred_errors_is_the_mean_of_the_worst_ten_or_five():
         tail_mean([])
 
 
-def test_the_signed_rank_test_enumerates_all_signs():
-    """Exact two-sided p-value of nine distinct differences by counting."""
-    difference = np.array([0.3, -0.1, 0.9, 1.2, -0.4, 2.0, 0.7, 1.6, 0.05])
-    ranks = stats.rankdata(np.abs(difference))
-    observed = ranks[difference > 0].sum()
-    sums = [ranks[np.array(signs)].sum() for signs in itertools.product([False, True], repeat=9)]
-    share = 2 * min(np.mean(np.array(sums) >= observed), np.mean(np.array(sums) <= observed))
-    assert signed_rank_p_value(difference) == pytest.approx(min(1.0, share))
-
-
-def test_zeros_keep_their_ranks_as_pratt_has_it():
-    """Normal approximation by hand: zeros are ranked, then left out of the sum and of its variance."""
-    difference = np.round(np.random.default_rng(0).normal(0.05, 0.1, 60) / 0.05) * 0.05
-    ranks = stats.rankdata(np.round(np.abs(difference), 9))
-    moved = np.abs(difference) > 1e-9
-    assert 5 < np.sum(~moved) < 20
-    distance = abs(ranks[difference > 1e-9].sum() - ranks[moved].sum() / 2) / np.sqrt(np.sum(ranks[moved] ** 2) / 4)
-    assert signed_rank_p_value(difference) == pytest.approx(2 * stats.norm.sf(distance), rel=1e-9)
-
-
-def test_equal_pairs_are_no_evidence_and_rounding_makes_no_ranks():
-    assert signed_rank_p_value(np.zeros(5)) == 1.0
-    exact = np.array([1, 1, 1, 0, 0, -1, 1, 1, 2, 1]) / 20
-    blurred = exact + 1e-15 * np.arange(10)
-    assert signed_rank_p_value(blurred) == signed_rank_p_value(exact)
-    assert signed_rank_p_value(1e-12 * exact) == signed_rank_p_value(exact)
+def test_a_majority_is_what_counting_all_signs_says():
+    for count in range(6, 12):
+        sums = [sum(signs) for signs in itertools.product([0, 1], repeat=count)]
+        for ones in range(count + 1):
+            assert is_majority(ones, count - ones) == (np.mean(np.array(sums) >= ones) < 0.05)
+    assert not is_majority(5, 0)
+    assert not is_majority(0, 0)
 
 
 def three_controllers():
@@ -184,50 +168,115 @@ def three_controllers():
     return table(controller=["a"] * 25 + ["b"] * 25 + ["c"] * 25, seed=[*range(25)] * 3, settling_time_s=values)
 
 
-def test_the_p_values_of_all_pairs_are_corrected_together():
-    found = compare_pairs(three_controllers(), [("a", "b"), ("a", "c"), ("b", "c")], never=10.0)
-    raw = [comparison.p_value for comparison in found]
-    assert [comparison.corrected_p_value for comparison in found] == holm(raw)
-    assert raw[0] < 1e-6 < raw[1]
-
-
-def test_the_better_controller_has_a_negative_difference_of_pairs_and_not_of_medians():
+def test_the_better_controller_has_a_negative_mean_difference_of_pairs_and_not_of_means():
     runs = three_controllers()
-    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
+    (found,) = compare_pairs(runs, [("a", "b")])
     paired = runs.pivot_table(index="seed", columns="controller", values="settling_time_s")
-    assert found.difference.value == pytest.approx((paired["a"] - paired["b"]).median())
-    assert found.difference.low < found.difference.value < found.difference.high < 0.0
-    assert found.difference.count == 25
+    interval = stats.ttest_rel(paired["a"], paired["b"]).confidence_interval(0.9)
+    assert found.mean.value == pytest.approx((paired["a"] - paired["b"]).mean())
+    assert (found.mean.low, found.mean.high) == pytest.approx(tuple(interval), rel=1e-9)
+    assert (found.mean.count, found.verdict, found.probability.value) == (25, "better", 1.0)
+    assert compare_pairs(runs, [("b", "a")])[0].verdict == "worse"
 
 
 def test_only_common_seeds_make_pairs_in_any_order_of_rows():
     runs = three_controllers()
     some = runs[(runs["controller"] == "a") | (runs["seed"] >= 15)]
-    (found,) = compare_pairs(some.sample(frac=1.0, random_state=0), [("a", "b")], never=10.0)
-    (same,) = compare_pairs(runs[runs["seed"] >= 15], [("a", "b")], never=10.0)
-    assert found.difference.count == 10
-    assert (found.difference.value, found.p_value) == (same.difference.value, same.p_value)
+    (found,) = compare_pairs(some.sample(frac=1.0, random_state=0), [("a", "b")])
+    (same,) = compare_pairs(runs[runs["seed"] >= 15], [("a", "b")])
+    assert found.mean.count == 10
+    assert found.mean.value == pytest.approx(same.mean.value)
 
 
-def test_a_run_that_never_settled_or_ended_early_counts_as_the_whole_duration():
-    runs = table(controller=list("ab") * 2, seed=[0, 0, 1, 1], settling_time_s=[1.0, NEVER, 2.0, 0.5])
+def test_a_run_that_never_settled_or_ended_early_is_lost_and_worse_than_any():
+    runs = table(controller=list("ab") * 3, seed=[0, 0, 1, 1, 2, 2], settling_time_s=[1.0, NEVER, 2.0, 0.5, 3.0, 2.0])
     runs.loc[3, "status"] = "feature_lost"
-    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
-    assert isinstance(found, Comparison)
-    assert found.difference.value == pytest.approx(np.median([1.0 - 10.0, 2.0 - 10.0]))
+    (found,) = compare_pairs(runs, [("a", "b")])
+    assert (found.lost, found.mean.value, found.mean.count) == ((0, 2), 1.0, 1)
+    assert found.probability.value == pytest.approx(2.0 / 3.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(shift=st.floats(-0.1, 0.1), spread=st.sampled_from([0.01, 0.05, 0.2]), seed=st.integers(0, 99))
+def test_equivalent_is_what_two_one_sided_t_tests_say(shift, spread, seed):
+    rng = np.random.default_rng(seed)
+    first = rng.uniform(1.0, 2.0, 20)
+    second = first + rng.normal(shift, spread, 20)
+    found = paired_difference(first, second, 0.05)
+    p_value, _, _ = ttost_paired(first, second, -0.05, 0.05)
+    assert (found.verdict == "equivalent") == (p_value < 0.05)
+    for side, verdict in (("less", "better"), ("greater", "worse")):
+        beyond = stats.ttest_1samp(first - second, -0.05 if side == "less" else 0.05, alternative=side).pvalue < 0.05
+        assert (found.verdict == verdict) == beyond
+
+
+def test_methods_that_differ_by_the_margin_are_called_equivalent_or_better_in_a_twentieth_of_samples():
+    rng = np.random.default_rng(8)
+    told = [paired_difference(values, np.zeros(15), 1.0).verdict for values in rng.normal(-1.0, 2.0, (2000, 15))]
+    assert told.count("better") / 2000 == pytest.approx(0.05, abs=0.015)
+    assert told.count("equivalent") / 2000 <= 0.065
+
+
+def test_the_probability_to_be_better_is_counted_with_ties_as_halves():
+    rng = np.random.default_rng(9)
+    first, second = rng.integers(0, 4, (2, 50)).astype(float)
+    first[:5], second[3:9] = np.inf, NEVER
+    found = paired_difference(first, second, 0.0)
+    values = np.nan_to_num(np.stack([first, second]), nan=9.0, posinf=9.0)
+    counted = sum(0.5 if a == b else float(a < b) for a, b in values.T)
+    assert found.probability.value == pytest.approx(counted / 50)
+    assert found.lost == (5, 6)
+
+
+@pytest.mark.parametrize(
+    ("lost", "shift", "verdict"),
+    [
+        ((0, 6), 0.5, "better"),
+        ((0, 5), 0.5, "worse"),  # five signs tell nothing
+        ((6, 0), 0.0, "worse"),
+        ((1, 0), 0.0, "equivalent"),
+        ((2, 0), 0.0, "undecided"),  # 2 of 40 are more than three points
+        ((40, 40), 0.0, "undecided"),
+    ],
+)
+def test_lost_runs_come_first_where_a_sign_test_tells_them_apart(lost, shift, verdict):
+    base = np.linspace(1.0, 2.0, 40)
+    first, second = base + shift + 0.01 * np.sin(7.0 * base), base.copy()
+    first[: lost[0]], second[40 - lost[1] :] = NEVER, np.inf
+    assert paired_difference(first, second, 0.05).verdict == verdict
+
+
+def test_few_robots_and_samples_without_a_spread_decide_nothing_by_themselves():
+    assert paired_difference(np.zeros(5), np.ones(5), 0.1).verdict == "undecided"
+    assert paired_difference(np.zeros(6), np.ones(6), 0.1).verdict == "better"
+    alone, none = (mean_with_interval(np.full(count, 2.0)) for count in (1, 0))
+    assert (alone.value, np.isnan(alone.low), none) == (2.0, True, NO_ESTIMATE)
+    assert paired_difference([], [], 0.1).probability == NO_ESTIMATE
+
+
+def test_margins_are_a_period_a_share_of_the_band_or_of_the_bound_and_a_hundredth():
+    runs = table(controller=["ukf_mfac", "calibrated", "calibrated", "calibrated"]).assign(settling_band=0.005)
+    assert margin("settling_time_s", runs) == 0.05
+    assert margin("settling_time_s", runs.assign(period_s=0.2)) == 0.2
+    assert margin("overshoot", runs) == 0.01
+    errors = runs.assign(rms_error_evaluated=[0.1, 0.0014, 0.0012, NEVER])
+    assert margin("rms_error_evaluated", errors) == pytest.approx(0.2e-3)
+    assert margin("rms_error_evaluated", errors.assign(rms_error_evaluated=[0.1, 0.01, 0.02, 0.02])) == pytest.approx(
+        2e-3
+    )
+    assert margin("control_effort_rad", runs) == margin("mass", runs) == 0.0
 
 
 @pytest.mark.parametrize(
     ("pairs", "change", "message"),
     [
-        ([], {}, "pairs must hold at least one pair"),
         ([("a", "nobody")], {}, "a and nobody have no run in common"),
         ([("a", "b")], {"seed": 0}, "a has several runs of the same plant, task, mismatch, seed"),
     ],
 )
 def test_comparisons_that_cannot_be_made_are_refused(pairs, change, message):
     with pytest.raises(ValueError, match=message):
-        compare_pairs(three_controllers().assign(**change), pairs, never=10.0)
+        compare_pairs(three_controllers().assign(**change), pairs)
 
 
 def test_runs_are_classed_by_how_they_ended():
@@ -240,8 +289,8 @@ def test_runs_are_classed_by_how_they_ended():
 def test_runs_that_all_ended_before_their_first_period_have_no_metrics_and_are_classed_all_the_same():
     runs = table(controller=["a", "b"], seed=[0, 0]).assign(status="crashed")
     assert outcomes(runs).tolist() == ["crashed", "crashed"]
-    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
-    assert found.p_value == 1.0
+    (found,) = compare_pairs(runs, [("a", "b")])
+    assert (found.mean, found.verdict) == (NO_ESTIMATE, "undecided")
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,10 @@ def judge_controllers(runs):
     return next(statistics_tables(runs))[1]
 
 
-def compare_controllers(runs, metric=None, never=None):
+def compare_controllers(runs, metric=None):
     """Return the table of pairs of one place."""
-    _, (_, pairs) = statistics_tables(runs, metric, never)
+    _, (title, pairs) = statistics_tables(runs, metric)
+    assert title == f"pairs, verdicts with a margin of {'0.2 mm' if (runs['task_kind'] == 'curve').all() else '0.05 s'}"
     return pairs
 
 
@@ -68,26 +69,30 @@ def test_each_controller_has_rates_medians_tails_and_failures(runs):
 
 
 def test_pairs_are_compared_on_common_seeds(runs):
-    (row,) = compare_controllers(runs, never=10.0).to_dict("records")
+    (row,) = compare_controllers(runs).to_dict("records")
     assert row["pair"] == "quick − slow"
-    assert row["pairs"] == "20"
-    assert row["difference in settling time, s"].startswith("-1.1")
-    assert float(row["p after Holm"]) < 0.001
-    assert len(list(statistics_tables(runs[runs["controller"] == "quick"], never=10.0))) == 1
+    assert row["lost"] == "0 : 4"
+    assert row["mean difference in settling time, s"].startswith("-1.1")
+    assert row["verdict"] == "better"
+    assert row["P(better)"] == "1.00 [0.84, 1.00]"
+    assert len(list(statistics_tables(runs[runs["controller"] == "quick"]))) == 1
 
 
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     better = runs["controller"] == "quick"
     curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
+    curve["settling_band"] = 0.005
     (row,) = compare_controllers(curve).to_dict("records")
-    assert row["difference in RMS of the judged part, mm"] == "-1.50 [-1.50, -1.50]"
+    assert row["mean difference in RMS of the judged part, mm"] == "-1.50 [-1.50, -1.50]"
+    assert row["verdict"] == "better"
 
 
 def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
     late = runs.assign(settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0))
-    few = late[late["seed"] < 4]  # of which the slow one settles in none
+    few = late[late["seed"] < 8]  # of which the slow one settles in four
     (row,) = compare_controllers(few).to_dict("records")
-    assert row["difference in settling time, s"].startswith("-31.0")
+    assert row["mean difference in settling time, s"].startswith("28.9")
+    assert (row["lost"], row["P(better)"][:4]) == ("0 : 4", "0.50")
 
 
 def test_an_unknown_metric_is_told_in_one_line(runs):
@@ -123,7 +128,7 @@ def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypa
         words = " ".join([*table.columns, *table.astype(str).to_numpy().ravel()]).split()
         assert set(words) <= set(text.split())
     assert text.count("a title") == text.count("a legend") == 1
-    assert text.count("rbfnn_mfac:published") == (3 if room <= 80 else 2)
+    assert text.count("rbfnn_mfac:published") == {60: 4, 80: 3}.get(room, 2)
 
 
 def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys):
@@ -207,7 +212,7 @@ def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither
 
 def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
     folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
-    assert servobench(monkeypatch, "statistics", str(folder), "--json", "--never", "10") == 0
+    assert servobench(monkeypatch, "statistics", str(folder), "--json") == 0
     (place,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     quick, slow = place["controllers"]
     settled = slow["settled, %"]
@@ -215,7 +220,8 @@ def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
     assert quick["settled, %"]["low"] == pytest.approx(83.9, abs=0.05)
     assert slow["worst 5 %, mm"] == "inf"
     (pair,) = place["pairs"]
-    assert pair["difference in settling time, s"]["value"] < -1.0
+    assert pair["mean difference in settling time, s"]["value"] < -1.0
+    assert (pair["lost"], pair["verdict"], pair["margin"]) == ("0 : 4", "better", "0.05 s")
     assert servobench(monkeypatch, "statistics", str(folder), "--json", "--markdown") == 2
 
 
