@@ -170,15 +170,14 @@ class KinematicWorld(World):
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
-        a = self._a
-        if self._config.overshoot > 0.0:
-            joints = self._q, self._v, self._a
-            q, v, a = follow_with_overshoot(joints, joint_velocity, self._config, self._part)
+        a, swings = self._a, self._config.overshoot > 0.0
+        if swings:
+            q, v, a = follow_with_overshoot((self._q, self._v, a), joint_velocity, self._config, self._part)
         if not is_finite(q):
             q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
         self._v = np.where(self._q == q, v, 0.0)
-        if self._config.overshoot > 0.0:
+        if swings:
             self._a = np.where(self._q == q, a, 0.0)
 
     def see(self) -> FloatArray:

@@ -252,11 +252,9 @@ class TunedValues:
 
 def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
     """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
-    space: Mapping[str, Any] = find_space(name)
-    values, lines = flatten(nested), []
-    for key, end in edges(space, values).items():
-        lines.append(f"{key} = {values[key]:.4g} is at the {end} edge of {space[key].low:g} to {space[key].high:g}")
-    return tuple(lines)
+    values, boxes = flatten(nested), dict[str, Any](find_space(name))
+    ends = ((key, end, boxes[key]) for key, end in edges(boxes, values).items())
+    return tuple(f"{key} = {values[key]:.4g} is at the {end} edge of {b.low:g} to {b.high:g}" for key, end, b in ends)
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:

@@ -1,10 +1,8 @@
 """The objective of tuning, and the runs on which it is measured.
 
-For each plant, `robots` runs in each of eight worlds. A world has a task and a control rate of `KINDS`, among them
-moves that leave the box of the networks, 5 Hz and 125 Hz, and one of the levels of each of `LEVELS`: latency, noise,
-faults of the detector and the drive. Every run has a robot of its own with one of `MODELS`, from `moderate` to joint
-zeros that are wrong by up to 180°. Levels and models occur equally often, as far as their number allows, in an order
-that the seed of the set draws: so nobody has chosen which of them meet, and the second set has other worlds.
+For each plant, `robots` runs in each of eight worlds: a task at a control rate, of `KINDS`, with one level of each of
+`LEVELS`. Every run has a robot of its own with one of `MODELS`. Levels and models occur equally often, as far as their
+number allows, in an order that the set's seed draws: nobody chooses which meet, and the second set has other worlds.
 
     score = mean over the runs of weight · cost                              (0 is perfect, 1 the worst)
 
@@ -15,9 +13,8 @@ that the seed of the set draws: so nobody has chosen which of them meet, and the
     1 if the run did not complete
 
 Errors e below the floor of 1.5 mm cost nothing, and above 1 m all the same. The cost is continuous in the error: a run
-that comes within the settling band late, or leaves it for one period, costs hardly more than one that does not. Each
-instant of a move counts alike, so a second more at an error costs the same whenever it is spent, and for an approach
-at one rate the cost grows in proportion to the settling time. A curve's cost is the logarithm of what it is judged by.
+that leaves the settling band late costs hardly more than one that does not. Each instant of a move counts alike, so the
+cost of an approach grows in proportion to its settling time. A curve's cost is the logarithm of what it is judged by.
 """
 
 from __future__ import annotations
@@ -49,10 +46,9 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     "circle": {"radius": 0.17, "lap_time": 5.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.14, "lap_time": 5.0},
 }  # settings of the tasks, short because a settled run needs no more time
-BEYOND: Final = 0.5  # [rad] by which the box of start and target is larger each way in moves that leave the networks'
-_LEAVING: Final[Varied] = (
-    ("task.lower", tuple(low - BEYOND for low in TRAINING_LOWER)),
-    ("task.upper", tuple(high + BEYOND for high in TRAINING_UPPER)),
+_LEAVING: Final[Varied] = (  # the networks' box by 0.5 rad each way
+    ("task.lower", tuple(low - 0.5 for low in TRAINING_LOWER)),
+    ("task.upper", tuple(high + 0.5 for high in TRAINING_UPPER)),
 )
 KINDS: Final[tuple[tuple[str, Varied], ...]] = (
     (MOVE, ()),
