@@ -18,6 +18,7 @@ from servobench.harness.analysis.comparison import (
     outcomes,
     settled_share,
     settling_times,
+    texts_of,
 )
 from servobench.harness.analysis.statistics import (
     MISSING,
@@ -68,7 +69,13 @@ def settled(runs: pd.DataFrame) -> int:
 
 def settling(runs: pd.DataFrame, digits: int = 2) -> str:
     """Return the median settling time with its interval [s]; a dash where half of the runs or more never settle."""
-    return short(median_with_interval(settling_times(runs)), digits)
+    return with_lost(short(median_with_interval(settling_times(runs)), digits), runs)
+
+
+def with_lost(cell: str, runs: pd.DataFrame) -> str:
+    """Return a cell with the share of runs that neither settled nor followed their curve, where there are any."""
+    lost = 100.0 - achieved_share(runs).value
+    return f"{cell}, {lost:.0f} % lost" if lost >= 0.5 else cell
 
 
 def share(runs: pd.DataFrame) -> str:
@@ -82,8 +89,7 @@ def millimetres(runs: pd.DataFrame, column: str = "rms_error_evaluated", digits:
     Of a curve that not all runs followed, the share of lost runs is told, too.
     """
     middle = short(median_with_interval(1000.0 * column_of(runs, column).where(runs["status"] == COMPLETED)), digits)
-    lost = 100.0 - achieved_share(runs).value
-    return f"{middle}, {lost:.0f} % lost" if lost and (runs["task_kind"] == CURVE).all() else middle
+    return with_lost(middle, runs) if (texts_of(runs, "task_kind") == CURVE).all() else middle
 
 
 def worst_errors(runs: pd.DataFrame) -> str:

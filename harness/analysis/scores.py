@@ -17,12 +17,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from servobench.harness.analysis.statistics import CONFIDENCE, RESAMPLES, Estimate, holm
+from servobench.harness.analysis.statistics import ALPHA, CONFIDENCE, RESAMPLES, Estimate, holm
 from servobench.plant.contract.checks import FloatArray
 
 TRIMMED: Final = 0.25  # share of the scores that an interquartile mean leaves out at each end
 SPLITS: Final = 200  # random halves of the robots from which the resolution is estimated
-LEVEL: Final = 0.05  # of significance
 
 
 @dataclass(frozen=True)
@@ -213,4 +212,4 @@ def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[s
         with np.errstate(under="ignore"):
             p_values.append(2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain)
     corrected = holm(p_values)
-    return {frozenset(pair) for pair, p_value in zip(pairs, corrected, strict=True) if p_value < LEVEL}
+    return {frozenset(pair) for pair, p_value in zip(pairs, corrected, strict=True) if p_value < ALPHA}

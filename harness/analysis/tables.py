@@ -414,6 +414,8 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
         if counted:
             row["Runs", "number"] = str(len(own))
             row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
+        else:
+            row["Runs", "lost [%]"] = f"{100.0 - achieved_share(own).value:.0f}"
         for group, name in _columns(kind, runs):
             middle = _median_of(own, name, shown_unit(name, runs)[1])
             row[group, metric_heading(name, runs)] = f"{middle:.{METRICS[name].digits}f}"

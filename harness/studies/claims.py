@@ -225,12 +225,14 @@ def _leaving(tables: Tables, plant: str) -> Answer:
 
 def _circle(tables: Tables, plant: str) -> Answer:
     measured = [circle_error(tables[MAIN], name) for name in (PROPOSED, *OTHERS)]
-    own = tables[MAIN][(tables[MAIN]["task"] == CIRCLE) & (tables[MAIN]["controller"] == PROPOSED)]
-    good = int(((own["rms_error_evaluated"] <= MAX_CIRCLE_ERROR) & (own["status"] == COMPLETED)).sum())
+    laps = tables[MAIN][tables[MAIN]["task"] == CIRCLE]
+    followed = (laps["rms_error_evaluated"] <= MAX_CIRCLE_ERROR) & (laps["status"] == COMPLETED)
+    lost, own = (~followed).groupby(laps["controller"]).sum(), followed[laps["controller"] == PROPOSED]
+    good = int(own.sum())
     rate, most = success_rate(good, len(own)), success_rate(len(own), len(own))
     holds = rate.low > MIN_CIRCLE_SHARE if most.low > MIN_CIRCLE_SHARE or rate.high < MIN_CIRCLE_SHARE else None
     share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, holds)
-    words = ", ".join(f"{m.label} {m.estimate:.1f} mm" for m in measured)
+    words = ", ".join(f"{m.label} {m.estimate:.1f} mm ({lost[m.label]} lost)" for m in measured)
     evidence = f"within 10 mm in {good} of {len(own)}; medians {words}"
     return answer("5", "tracks a circle of 0.3 m radius", plant, [share], evidence, measured)
 

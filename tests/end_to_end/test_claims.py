@@ -136,6 +136,16 @@ def test_runs_that_never_settle_or_fail_count_as_slow():
     assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
 
 
+def test_the_medians_of_circles_come_with_the_number_of_lost_ones():
+    made = tables(rms_error_evaluated=proposed(-0.015))
+    lap = (made[MAIN]["task"] == CIRCLE) & (made[MAIN]["controller"] == PROPOSED)
+    made[MAIN].loc[lap & (made[MAIN]["seed"] < 3), "rms_error_evaluated"] = 0.15
+    (told,) = (answer.evidence for answer in answer_all(made, "kinematic") if answer.claim == "5")
+    assert told.startswith("within 10 mm in 17 of 20; medians rbfnn_mfac 5.0 [")
+    assert "mm (3 lost), rbf_pid 20.0 [" in told
+    assert told.endswith("(20 lost)")
+
+
 def test_times_that_are_equal_but_for_rounding_do_not_differ():
     """The binary numbers next to 0.1 + 0.2 and 0.3 differ; the sign of such a rest decided claim 4 once."""
     made = tables()

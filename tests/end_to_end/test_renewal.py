@@ -252,6 +252,15 @@ def test_numbers_of_runs_that_crashed_are_not_stored(toy):
         call(toy)
 
 
+def test_a_median_of_curves_tells_the_share_of_lost_runs():
+    runs = pd.DataFrame({
+        "task": "circle", "task_kind": "curve", "status": "completed", "settling_band": 0.005,
+        "rms_error_evaluated": [0.002, 0.002, 0.15, 0.002],
+    })  # fmt: skip
+    assert cells.millimetres(runs) == "2.0 [2.0, 150.0], 25 % lost"
+    assert cells.millimetres(runs[runs["rms_error_evaluated"] < 0.1]) == "2.0 [2.0, 2.0]"
+
+
 def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
     robots = np.arange(20)
 

@@ -29,6 +29,11 @@ def test_a_move_that_never_settled_counts_as_the_last_to_settle():
     assert row["Error", "last second [mm]"] == "1.00 [1.00, 1.00]"
 
 
+def test_beside_the_medians_of_computing_times_stands_the_share_of_lost_runs():
+    lost = moves(1.0, 2.0, np.nan).assign(outcome=["settled", "settled", "not_settled"])
+    assert tables.cost_table(lost)["Runs", "lost [%]"].tolist() == ["33"]
+
+
 def test_a_single_run_has_a_value_without_an_interval():
     (table,) = tables.move_tables(moves(1.0)).values()
     assert table["Time", "settling time [s]"].tolist() == ["1.00"]
