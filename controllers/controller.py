@@ -58,6 +58,7 @@ class RobotKnowledge:
             under the same condition.
         true_delays: of the true robot and its camera; under the same condition.
         true_camera_turn: rad/s, with which the first camera turns about its optical axis; under the same condition.
+        true_tool: natural frequency [rad/s] and damping ratio of a flexible tool, 0 for a rigid one; likewise.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
@@ -74,6 +75,7 @@ class RobotKnowledge:
     true_symbolic: SymbolicFeature | None = None
     true_delays: Delays | None = None
     true_camera_turn: float = 0.0
+    true_tool: tuple[float, float] = (0.0, 0.0)
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
     unit: float = 1.0

@@ -76,7 +76,8 @@ class NmpcCalibrated(Controller):
     offset-free: b is the median, component by component, of y − h(q(t − a)) over the frames of `image_window`, with the
     true age a of each frame, so that fewer than half of them may be outliers. Where frames are late by unknown times, a
     is the age within the true bounds at which the frame agrees best with the present b. Where the camera is known to
-    turn, features and reference are taken into the frame of its first pose.
+    turn, features and reference are taken into the frame of its first pose; where the tool is known to be flexible,
+    commands pass an input shaper, whose delay is bridged as well.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -94,15 +95,17 @@ class NmpcCalibrated(Controller):
         knowledge = in_natural_units(knowledge)
         period = knowledge.spec.period
         blocks = Blocks.of(config.horizon_time, config.moves, period)
-        reach = blocks.count * blocks.length + config.delay
+        self._taps = zero_vibration_taps(*knowledge.true_tool, period) if config.image else np.ones(1)
+        delay = config.delay + period * float(np.arange(len(self._taps)) @ self._taps)
+        reach = blocks.count * blocks.length + delay
         check_preview(reach, knowledge.preview, period, "horizon_time + delay")
         if knowledge.true_symbolic is None:
             raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
         self._config, self._spec, self._knowledge = config, knowledge.spec, knowledge
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
-        self._blocks, self._places = blocks, blocks.places(config.delay)
-        self._to_come = bridging_shares(config.delay, period)
+        self._blocks, self._places = blocks, blocks.places(delay)
+        self._to_come = shaped_shares(bridging_shares(config.delay, period), self._taps)
         self._along_plan = self._model.map(blocks.count)
         self._shares = decay_shares(blocks.count, config.decay * blocks.length)
         ages = exposure_ages(knowledge.true_delays or Delays(0.0, 0.0, 0.0), period)
@@ -154,7 +157,7 @@ class NmpcCalibrated(Controller):
         if self._config.image:
             self._observe(observation, feature)
         start = present + self._to_come @ self._sent
-        places = np.arange(len(reference)) * self._spec.period
+        places: FloatArray = self._spec.period * np.arange(float(len(reference)))
         rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
@@ -165,7 +168,11 @@ class NmpcCalibrated(Controller):
         later = np.concatenate([plan[1:], plan[-1:]])
         self._plan = (1.0 - passed) * plan + passed * later if success else np.zeros_like(plan)
         self._last = velocity * self._blocks.length
-        self._sent = np.concatenate([self._sent, velocity[None] * self._spec.period])[1:]
+        sent = np.concatenate([self._sent, velocity[None] * self._spec.period])
+        self._sent = sent[1:]
+        if len(self._taps) > 1:
+            shaped = self._taps @ sent[: -1 - len(self._taps) : -1] / self._spec.period
+            velocity = np.clip(shaped, -limit, limit)
         return Command(velocity)
 
     def diagnostics(self) -> Diagnostics:
@@ -276,6 +283,41 @@ def exposure_ages(delays: Delays, period: float) -> FloatArray:
     """
     youngest, spread = in_periods(delays.latency, period), in_periods(delays.latency_spread, period)
     return np.array([youngest]) if spread == 0.0 else youngest + np.arange(0.0, spread + 1.0, 1.0 / AGES)
+
+
+def zero_vibration_taps(frequency: float, damping: float, period: float) -> FloatArray:
+    """Return the taps of an input shaper after which a damped oscillator does not swing, (k,), the newest first.
+
+    The second of two impulses, half a damped oscillation T later, cancels the first: 1/(1 + K) and K/(1 + K) with
+    K = exp(−ζ ω T) (zero-vibration shaper; Singer and Seering, J. Dyn. Syst. Meas. Control 112, 1990). Between control
+    instants it is shared by the two beside it.
+
+    Args:
+        frequency: ω, natural frequency [rad/s]; 0 for nothing that swings.
+        damping: ζ, below 1.
+        period: of control [s].
+    """
+    if frequency == 0.0:
+        return np.ones(1)
+    half = math.pi / (frequency * math.sqrt(1.0 - damping**2))
+    second = 1.0 - 1.0 / (1.0 + math.exp(-damping * frequency * half))
+    place = in_periods(half, period)
+    taps = np.zeros(2 + int(place))
+    taps[int(place) :] = second * np.array([1.0 - place % 1.0, place % 1.0])
+    taps[0] += 1.0 - second
+    return taps
+
+
+def shaped_shares(to_come: FloatArray, taps: FloatArray) -> FloatArray:
+    """Return the share of each of the last steps planned that is to come after an input shaper, the newest one last.
+
+    Args:
+        to_come: the same of steps commanded, see `bridging_shares`.
+        taps: of the shaper, the newest first.
+    """
+    ages = np.arange(len(to_come) + len(taps) - 1, 0, -1)[:, None] - np.arange(len(taps))
+    commanded = np.concatenate([to_come[::-1], np.zeros(len(taps))])
+    return np.where(ages <= 0, 1.0, commanded[np.maximum(ages, 1) - 1]) @ taps
 
 
 def _linearisation(symbolic: Any, n: int, m: int) -> casadi.Function:  # noqa: ANN401 - CasADi expressions

@@ -351,6 +351,7 @@ def _build_controller(
                 true_symbolic=true.symbolic,
                 true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread),
                 true_camera_turn=true.camera_turn,
+                true_tool=true.tool,
             )
         return entry.build(config, knowledge)
     except ValueError as error:

@@ -282,6 +282,7 @@ class Bench(Plant):
         return replace(
             model, latency=sensing.latency, command_delay=self._command_delay, lag=self.world.lag,
             latency_spread=sensing.jitter + 2.0 * sensing.latency_swing, camera_turn=sensing.camera_turn,
+            tool=(mechanics.tool_frequency, mechanics.tool_damping),
         )  # fmt: skip
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:

@@ -40,6 +40,7 @@ class TrueModel:
         lag: time constant of the joints' velocity loops, s; None where it is unknown.
         latency_spread: by which a frame may be later than the latency, s.
         camera_turn: with which the first camera turns about its optical axis, rad/s.
+        tool: natural frequency [rad/s] and damping ratio of a flexible tool; frequency 0 for a rigid one.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
@@ -49,6 +50,7 @@ class TrueModel:
     lag: float | None = None
     latency_spread: float = 0.0
     camera_turn: float = 0.0
+    tool: tuple[float, float] = (0.0, 0.0)
 
 
 class Abilities(ABC):

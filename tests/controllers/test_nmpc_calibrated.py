@@ -4,20 +4,30 @@ from dataclasses import replace
 import casadi
 import numpy as np
 import pytest
+from scipy.signal import lsim
 from scipy.spatial.transform import Rotation
 
 from kit.plants import nominal_ur5
 from kit.toy import plant_spec
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.laws.law import Estimate
+from servobench.controllers.laws.mpc.closed_form import bridging_shares
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig, exposure_ages
+from servobench.controllers.nmpc_calibrated import (
+    NmpcCalibrated,
+    NmpcCalibratedConfig,
+    exposure_ages,
+    shaped_shares,
+    zero_vibration_taps,
+)
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.faults import SolverFailed
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.mechanics import MechanicsConfig
 
 MODEL = nominal_ur5()
 SYMBOLIC = symbolic_feature(MODEL)
@@ -169,6 +179,41 @@ def test_a_camera_that_is_known_to_turn_shows_the_target_in_its_place():
             joints = joints + 0.05 * command.joint_velocity
             errors.append(np.linalg.norm(seen(joints, 0.05 * (k + 1)) - TARGET))
         assert (max(errors[40:]) < 1e-3) == image
+
+
+def test_the_taps_leave_an_oscillator_at_rest_after_a_step():
+    omega, damping, period = 20.0, 0.1, 0.001
+    taps = zero_vibration_taps(omega, damping, period)
+    assert taps.sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(zero_vibration_taps(0.0, 0.02, 0.05), [1.0])
+    A, B = [[0.0, 1.0], [-(omega**2), -2.0 * damping * omega]], [[0.0], [omega**2]]
+    step = np.cumsum(np.pad(taps, (0, 1000)))
+    swing = lsim((A, B, [[1.0, 0.0]], 0.0), step, period * np.arange(len(step)), interp=False)[1]
+    alone = lsim((A, B, [[1.0, 0.0]], 0.0), np.ones(1000), period * np.arange(1000), interp=False)[1]
+    assert np.abs(swing[len(taps) :] - 1.0).max() < 2e-3
+    assert alone.max() > 1.7
+
+
+def test_the_steps_to_come_behind_a_shaper_are_those_of_a_simulated_pipeline():
+    # Of a step, 3/4 is commanded at once and 1/4 a period later; commands take effect after 1.5 periods.
+    to_come = bridging_shares(0.075, 0.05)
+    np.testing.assert_allclose(to_come, [0.5, 1.0])
+    np.testing.assert_allclose(shaped_shares(to_come, np.array([0.75, 0.25])), [0.125, 0.625, 1.0])
+    np.testing.assert_array_equal(shaped_shares(to_come, np.ones(1)), to_come)
+
+
+def test_a_flexible_tool_that_is_known_comes_to_rest_at_the_target():
+    config = KinematicConfig(sensing=SensingConfig(feature_noise=0.0), mechanics=MechanicsConfig(tool_frequency=20.0))
+    errors = {}
+    for tool in ((0.0, 0.0), (20.0, 0.02)):
+        plant = build_kinematic(config, PlantSetup(MODEL, START, 0.05))
+        controller = NmpcCalibrated(NmpcCalibratedConfig(image=True), replace(knowledge(preview=16), true_tool=tool))
+        observation = plant.reset(0)
+        for _ in range(40):
+            observation = plant.step(controller.step(observation, hold(TARGET, 16)))
+            errors.setdefault(tool, []).append(np.linalg.norm(plant.truth().feature - TARGET))
+    assert 5.0 * max(errors[20.0, 0.02][10:]) < max(errors[0.0, 0.0][10:])
+    assert np.mean(errors[20.0, 0.02][30:]) < 0.001
 
 
 def test_a_lost_frame_leaves_the_offset_as_it_is():
