@@ -213,6 +213,8 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
         model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
     except ValueError as error:
         raise ConfigurationError(f"run {row['run_id']}: {error}") from error
+    if mismatch.size("camera_turn") > 0.0:
+        raise ConfigurationError(f"run {row['run_id']} cannot be shown: films have no camera that turns")
     logged = row.get("mismatch_values") or "{}"
     if json.loads(logged) != json.loads(json.dumps(sample.as_record())):
         raise ConfigurationError(

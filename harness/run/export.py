@@ -170,6 +170,9 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
+    if mechanical := [key for key in request.mismatch.plant_settings if key.startswith("mechanics.")]:
+        name = mechanical[0].removeprefix("mechanics.")
+        raise ConfigurationError(f"an arm is exported without {name}: leave it out, and set the FMU's parameter {name}")
     robot, (true, *_) = find_robot(request.robot), draw_robot(request)
     actuation = default_actuation(robot) if home is None else replace(default_actuation(robot), home=home)
     return product(ExportOptions(fmi, true, actuation, mismatch=words, robot=robot))
