@@ -36,7 +36,7 @@ from servobench.harness.pictures.style import (
     save_figure,
 )
 from servobench.harness.run.outcome import ACHIEVED
-from servobench.harness.run.resolution import check_settings
+from servobench.harness.run.resolution import check_settings, resolve_sections
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
 
@@ -73,6 +73,7 @@ def carry_out_suite(
         name: {**REFERENCE_SETTINGS.get(name, {}), **settings.sections.get(name, {})}
         for name in {*REFERENCE_SETTINGS, *settings.sections}
     }
+    resolve_sections(requests, Settings(sections))  # all challenges are checked before the first one runs
     parts = {name: Campaign(own, Settings(sections)) for name, own in runs.items()}
     tables = carry_out_parts(parts, out, how)
     judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)

@@ -6,6 +6,7 @@ import casadi
 import numpy as np
 import pytest
 
+from kit.plants import NEEDS_MUJOCO
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run.episode import run_experiment
@@ -29,6 +30,7 @@ def test_bounds_are_given_the_kinematics_of_rippled_gears():
     np.testing.assert_allclose(feature(start).full().ravel(), truth.feature, atol=1e-12)
 
 
+@NEEDS_MUJOCO
 def test_worlds_without_gears_and_tool_are_refused_in_one_line():
     mismatch = Mismatch.parse("moderate+backlash=2deg")
     with pytest.raises(ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"):

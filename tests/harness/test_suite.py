@@ -155,6 +155,7 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
     assert {row["controller"].value for row in ranking_rows(judged)} == set(lost)
 
 
+@pytest.mark.slow
 def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_stopped(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "short.toml").write_text(WORLD + "settings.task.duration = 2.0", encoding="utf-8")
@@ -174,7 +175,12 @@ def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_setting_that_nothing_reads_is_refused(monkeypatch, capsys, tmp_path):
-    words = ["suite", "--challenges", "severe", "--controllers", "constant", "--out", str(tmp_path / "suite"), "--set"]
-    assert servobench(monkeypatch, *words, "circle.lap_time=3") == 2
-    assert "'circle' does not run here" in capsys.readouterr().err
+def test_settings_are_checked_for_all_challenges_before_the_first_one_runs(monkeypatch, capsys, tmp_path):
+    words = ["suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", str(tmp_path / "suite")]
+    for setting, message in (
+        ("lemniscate.lap_time=3", "'lemniscate' does not run here"),
+        ("circle.lap_time=-3", "circle.lap_time must be above 0, got -3"),
+    ):
+        assert servobench(monkeypatch, *words, "--set", setting) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "suite").exists()
