@@ -9,7 +9,7 @@ NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
-	  --controllers map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
+	  --controllers regression_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
 # For every save: half a minute, without the tests that are marked slow.
 check: lint

@@ -25,7 +25,8 @@ from servobench.plant.contract.signals import Command
 from servobench.plant.robot.mismatch import Mismatch
 
 METHODS = (
-    "ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbf_pid", "rbfnn_mfac"
+    "ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "regression_mfac", "ukf_mfac",
+    "rbf_pid", "rbfnn_mfac"
 )  # fmt: skip
 PERIODS, LIMIT = 200, 1e-9
 

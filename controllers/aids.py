@@ -61,9 +61,11 @@ class AidsConfig:
     noise: Annotated[Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))] = "given"
     """The standard deviation of the feature, as `feature_noise` or identified."""
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Kalman filter of the feature, predicted by the motion of the joints."""
-    model: Annotated[Literal["own", "nominal", "map"], Switch("map", tuned=("own", "nominal", "map"))] = "own"
-    """The estimator's own Jacobian, its deviation from the nominal one, or from the nominal one corrected by a map."""
+    """Filter of the feature: what the regression finds to be noise of the last frame is taken from it."""
+    model: Annotated[
+        Literal["own", "nominal", "regression"], Switch("regression", tuned=("own", "nominal", "regression"))
+    ] = "own"
+    """The estimator's own Jacobian, its deviation from the nominal one, or from a regression on the nominal one."""
     feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Feedforward of the reference's own motion; needs a preview."""
     posture: Annotated[bool, Switch(equipped=True)] = False
@@ -84,27 +86,10 @@ class AidsConfig:
     """[s] within which joints respond to a command; for an identified response."""
     feature_noise: Positive = 0.001
     """[unit of the feature] standard deviation of a feature; the first guess where it is identified."""
-    map_deviation: Positive = 1.0
-    """[1] of an entry of the map from the identity at first; 1: any camera is possible."""
-    map_walk: Annotated[NonNegative, Tuned(0.03, 3.0, log=True)] = 0.1
-    """[1/√m] deviation of an entry of the map after the feature has moved by a metre."""
-    # Tuned up to 0.1: with more the identified noise would be too small, and the delay biased.
-    map_error: Annotated[NonNegative, Tuned(0.01, 0.1, log=True)] = 0.1
-    """[1] share of a step that nominal model and map do not explain."""
-    rotation_deviation: NonNegative = 0.2
-    """[1] of an entry of the map from the nearest rotation; 0: the map is a rotation."""
-    confidence: Positive = 0.5
-    """[1] deviation of an entry of the map below which the estimator learns."""
     delay_margin: NonNegative = 6.0
     """[1] by which a delay must be better than the present one, in −2 log likelihood."""
     score_memory: Share = 1.0
     """[1] share of a delay's score that is kept from one motion to the next; below 1 for a latency that changes."""
-    detect_moves: bool = True
-    """Forget the map when the camera seems to have been moved."""
-    move_gate: Positive = 12.0
-    """[1] gate of the CUSUM of innovations, beyond which it seems so."""
-    filter_error: NonNegative = 0.2
-    """[1] error of the Jacobian as a share of its size, as the filter sees it."""
     posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0)] = 0.6
     """[1/s] gain of the null-space centring (`posture`)."""
     damping: Positive = 0.02

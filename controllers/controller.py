@@ -18,7 +18,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.controllers.camera_model import CameraModel
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.signals import Command, Observation, PlantSpec
 
@@ -64,8 +63,6 @@ class RobotKnowledge:
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
             needs the training defines both types. None: it is run when the controller is built.
         unit: one unit of the features here in units of the plant's; see `servobench.controllers.units`.
-        nominal_cameras: model of the nominal cameras; None where features are not those of single points in images,
-            or no model exists.
     """
 
     spec: PlantSpec
@@ -79,7 +76,6 @@ class RobotKnowledge:
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
     unit: float = 1.0
-    nominal_cameras: CameraModel | None = None
 
     def check(self, observation: Observation, reference: FloatArray | None = None) -> None:
         """Check the sizes of an observation and a reference.

@@ -144,13 +144,8 @@ _ROWS = (
         network_defaults={"damping": 0.02},
     ),
     Method(
-        "map_mfac", "mfac", "constant",
-        "the nominal Jacobian corrected by an estimated map of the camera, with model-free adaptive control",
-        {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
-    ),
-    Method(
-        "arm_mfac", "mfac", "arm",
-        "as map_mfac, with the gear ratios and joint zeros of the arm estimated as well",
+        "regression_mfac", "mfac", "constant",
+        "a regression on the nominal Jacobian, with model-free adaptive control",
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
     Method(

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
 from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.correntropy import (
     GmckfConfig,
@@ -66,7 +65,6 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "rbf": Part(RbfConfig, RbfEstimator, trained=True),
     "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
     "cfdl": Part(CfdlConfig, CfdlEstimator),
-    "arm": Part(ArmConfig, ArmEstimator),
 }
 
 LAWS: dict[str, Part[Law[Any]]] = {

@@ -92,7 +92,7 @@ class Servo:
         self.estimation = Estimation(estimator, knowledge, aids, delays)
         self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
-        self._feeds_forward, self._turns = aids.feedforward, law.in_model_frame and aids.model == "map"
+        self._feeds_forward, self._turns = aids.feedforward, law.in_model_frame and aids.model == "regression"
         self._rows = 1 + knowledge.preview if "preview" in law.owns else 1 + int(aids.feedforward)
         self._unit = knowledge.unit
 
@@ -155,16 +155,13 @@ class Servo:
         if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
         predictor, ahead, later = state.predictor, observation, reference
-        if self.predictor is not None and self.estimation.pairing is not None:
-            past = self.estimation.pairing.past(
-                estimation.learned.pair, observation.joint_position, self.predictor.window
-            )
-            predictor, ahead, lead = self.predictor.predict(predictor, J, past, observation)
+        if self.predictor is not None:
+            predictor, ahead, lead, J = self.predictor.predict(predictor, self.estimation, estimation, observation)
             later = shifted(reference, lead, self._rows)
         forward: FloatArray = np.zeros(())
         if self._feeds_forward:
             forward = later[..., 1, :] - later[..., 0, :]
-        law, wanted = self._command(state, estimation, ahead, later)
+        law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {wanted.tolist()}, by the Jacobian "
@@ -177,15 +174,14 @@ class Servo:
         return ServoState(estimation, law, state.initial, predictor, state.ready, limited), u
 
     def _command(
-        self, state: ServoState, estimation: EstimationState, ahead: Observation, reference: FloatArray
+        self, state: ServoState, estimation: EstimationState, J: FloatArray, ahead: Observation, reference: FloatArray
     ) -> tuple[Any, FloatArray]:
         """Return the law's new state and its joint velocity, (..., n), rad/s.
 
         A law that was trained on the nominal model works in its frame, into which features are rotated.
         """
-        J = estimation.jacobian
         if self._turns:
-            T = self.estimation.into_model_frame(estimation, ahead)
+            T = self.estimation.into_model_frame(estimation)
             J, reference = T @ J, reference @ T.mT
             ahead = ahead.with_values(ahead.joint_position, np.vecmat(ahead.feature, T.mT))
         return self.law.command(state.law, Estimate(J), ahead, reference)

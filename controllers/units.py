@@ -44,7 +44,6 @@ def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
         knowledge,
         spec=replace(knowledge.spec, feature=natural),
         nominal_jacobian=None if nominal is None else NaturalJacobian(nominal, scale),
-        nominal_cameras=None if knowledge.nominal_cameras is None else knowledge.nominal_cameras.in_unit(scale),
         true_jacobian=None if true is None else NaturalJacobian(true, scale),
         true_symbolic=None if symbolic is None else lambda q: symbolic(q) / scale,
         unit=scale * knowledge.unit,

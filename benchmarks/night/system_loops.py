@@ -37,9 +37,9 @@ class Loop(NamedTuple):
 
 LOOPS = (
     *(Loop(name + how) for name in ("ukf_mfac", "rbf_pid", "rbfnn_mfac") for how in ("", ":published")),
-    Loop("map_mfac"),
+    Loop("regression_mfac"),
     *(Loop("ukf_mfac:published", robot) for robot in ("ur10e", "panda")),
-    Loop("map_mfac", "ur10e"),
+    Loop("regression_mfac", "ur10e"),
     *(Loop("ukf_mfac:published", sensing=sensing) for sensing in ("pixel", "pixel:hand", "stereo", "plate")),
 )
 

@@ -28,8 +28,6 @@ class Motion:
         error: e = y_ref − y at the end of the motion, (..., m), m.
         duration: (...), s.
         noise: (...), standard deviation of the feature per axis, m; None where it is not identified.
-        interaction: B, (..., m, 3p), the change of the features with the places of p points by the camera model; None
-            without a camera model.
     """
 
     joint_position: FloatArray
@@ -38,7 +36,6 @@ class Motion:
     error: FloatArray
     duration: FloatArray
     noise: FloatArray | None = None
-    interaction: FloatArray | None = None
 
 
 class Estimator(ABC, Generic[State]):
@@ -72,12 +69,10 @@ class Estimator(ABC, Generic[State]):
         jacobian: FloatArray = one_matrix.J
         return jacobian
 
-    def motions(self, state: State, joint_position: FloatArray) -> FloatArray | None:
-        """Return the motions of points with the joints, (..., 3p, n) m/rad, if it estimates the arm itself; else None.
-
-        `Motion.interaction` maps them to features.
-        """
-        return None
+    def deviation(self, state: State, first: State | None, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ − Ĵ_first at `joint_position` (..., n), rad; Ĵ where there is no first state."""
+        jacobian = self.jacobian(state, joint_position)
+        return jacobian if first is None else jacobian - self.jacobian(first, joint_position)
 
     def diagnostics(self, state: State) -> Diagnostics:
         """Return named numbers (...) about the last update, if there are any; for the log only."""

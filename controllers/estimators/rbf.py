@@ -162,6 +162,11 @@ class RbfEstimator(Estimator[RbfState]):
         past = theta[..., 1:, :, :], joint_steps[..., 1:, :], feature_steps[..., 1:, :]
         return RbfState(rows, *past, filled, errors, step)
 
+    def deviation(self, state: RbfState, first: RbfState | None, joint_position: FloatArray) -> FloatArray:
+        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
+        rows = state.rows if first is None else state.rows - first.rows
+        return self._features.jacobian(rows, joint_position)
+
     def jacobian(self, state: RbfState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
         return self._features.jacobian(state.rows, joint_position)
@@ -231,6 +236,13 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
         rows = self._network.gradient(pull[..., None, :], dq, theta[..., None, :, :])
         np.add(rows, state.rows, out=rows)
         return RbfLyapunovState(rows, s)
+
+    def deviation(
+        self, state: RbfLyapunovState, first: RbfLyapunovState | None, joint_position: FloatArray
+    ) -> FloatArray:
+        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
+        rows = state.rows if first is None else state.rows - first.rows
+        return self._features.jacobian(rows, joint_position)
 
     def jacobian(self, state: RbfLyapunovState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""

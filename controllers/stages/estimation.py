@@ -1,37 +1,28 @@
 """The pair and estimate stages together: from observations to the Jacobian.
 
-    own        Ĵ(q) = E(q)                     E learns from (Δq, Δy)
-    nominal    Ĵ(q) = J_n(q) + E               E learns from (Δq, Δy − x)
-    map        Ĵ(q) = M̄ J_n(q) + E             E learns from (Δq, Δy − M̄ x)
-    map        Ĵ(q) = M̄ E(q)                   E learns from (Δq, RᵀΔy), where E brings a model itself
+    own          Ĵ(q) = E(q)                      E learns from (Δq, Δy)
+    nominal      Ĵ(q) = J_n(q) + E(q) − E₀(q)     E learns from (Δq, Δy − J_n Δq + E₀ Δq)
+    regression   Ĵ(q) = B(q) + E(q) − E₀(q)       E learns from (Δq, Δy − B Δq + E₀ Δq)
 
-With a camera model, a map stands between L(y, z), at the measured features, and the nominal motions G(q) of the points
-(`point_map`):
-
-    map        Ĵ(q) = L M̄ G(q) + E             E learns from (Δq, Δy − L M̄ x)
-    map        Ĵ(q) = L M̄ G(q) + E(q) − E₀(q)  E learns from (Δq, Δy − L M̄ x + E₀ Δq), where E brings a model E₀
-    map        Ĵ(q) = L M̄ G_E(q)               E learns from (Δq, Δy, L M̄), where E estimates the arm
-
-with the estimator E, the nominal Jacobian J_n, or Ĵ₀ where there is none, and from the pair stage the joint motion Δq
-that belongs to the feature's motion Δy, its prediction x by the model, the map M̄ and the rotation R nearest to it.
+with the estimator E, which is E₀ at first (0 where it estimates one matrix), the nominal Jacobian J_n, or Ĵ₀ where
+there is none, the regression B on J_n (`stages.regression`), and from the pair stage the joint motion Δq that belongs
+to the feature's motion Δy.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.camera_model import block_diagonal, feature_jacobian, turned_interaction
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
 from servobench.controllers.periods import whole_periods
-from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState
+from servobench.controllers.stages.pairing import Pairing, PairState
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, transposed
+from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.signals import BoolArray, Observation
 
 
@@ -74,11 +65,13 @@ class EstimationState(NamedTuple):
         learned: from motions.
         last: the frame at which the last motion ended.
         jacobian: Ĵ, (..., m, n), of this period; NaN before.
+        own: the part of it that is the estimator's.
     """
 
     learned: Learned
     last: LastFrame
     jacobian: FloatArray
+    own: FloatArray
 
 
 @final
@@ -91,41 +84,28 @@ class Estimation:
     """
 
     def __init__(self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays) -> None:
-        """Compose the stages.
-
-        Raises:
-            ValueError: a nominal model for an estimator that brings one.
-        """
-        if aids.model == "nominal" and estimator.brings_model:
-            raise ValueError(f"aids.model must be 'own' or 'map' for {type(estimator).__name__}, which brings a model")
+        """Compose the stages."""
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
-        self._adds = aids.model != "own" and not estimator.brings_model
-        self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
-        self._cameras = knowledge.nominal_cameras if aids.model == "map" else None
-        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._cameras) if aids.needs_past else None
+        period, self._filters = knowledge.spec.period, aids.filter
+        self._shortest = (max(1, whole_periods(MOTION_TIME, period)) - 0.5) * period
+        self.pairing = Pairing(aids, knowledge, delays.latency) if aids.needs_past else None
+        self._nominal = knowledge.nominal_jacobian
+        self._uses_own = estimator.brings_model and aids.model == "own"
         shape = knowledge.spec.m, knowledge.spec.n
-        self._first = estimator.start(np.zeros(shape)) if self._cameras and estimator.brings_model else None
-        at_rest = np.zeros(knowledge.spec.n)
-        self._estimates_arm = self._first is not None and estimator.motions(self._first, at_rest) is not None
-        asked = aids.model != "own" or (self.pairing is not None and self.pairing.learns)
-        self._nominal = knowledge.nominal_jacobian if asked and not estimator.brings_model else None
-        self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
+        self._first = estimator.start(np.zeros(shape)) if estimator.brings_model and aids.model != "own" else None
+        self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * period
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
         """Return the state before any motion, starting from Ĵ₀, (..., m, n), at rest."""
         lead, q = observation.feature.shape[:-1], observation.joint_position
-        pair, own = None, jacobian
-        if self.pairing is not None:
-            given = self._given_base(q, jacobian)
-            depth, motions = self._depths_and_motions(q)
-            pair = self.pairing.start(observation, given if self._cameras is None else motions, depth)
-            own = jacobian - given if self._adds else jacobian
-        estimator = self.estimator.start(own)
-        if pair is not None and self.estimator.brings_model and self._cameras is None:
-            pair = pair._replace(base=self.estimator.jacobian(estimator, q))
+        base = self._given(q, jacobian)
+        estimator = self.estimator.start(jacobian if self._model == "own" else jacobian - base)
+        if self._uses_own:
+            base = self.estimator.jacobian(estimator, q)
+        pair = None if self.pairing is None else self.pairing.start(observation, base)
         unknown, never = np.full(jacobian.shape, np.nan), np.full(lead, np.nan)[()]
         last = LastFrame(never, q, observation.feature, observation.valid, unknown)
-        return EstimationState(Learned(estimator, pair, never), last, unknown)
+        return EstimationState(Learned(estimator, pair, never), last, unknown, unknown)
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; without a valid feature nothing is learned.
@@ -136,116 +116,103 @@ class Estimation:
             desired: y_ref, (..., m), of this period.
         """
         learned, last, q = state.learned, state.last, observation.joint_position
-        pairing, (depth, motions) = self.pairing, self._depths_and_motions(q)
-        if pairing is not None:
-            learned = learned._replace(pair=pairing.advance(learned.pair, q, depth))
+        if self.pairing is not None:
+            before = learned.pair.base
+            base = self.estimator.jacobian(learned.estimator, q) if self._uses_own else self._given(q, before)
+            learned = learned._replace(pair=self.pairing.advance(learned.pair, q, base))
         duration, both = observation.time - last.time, observation.valid & last.valid
         due = np.logical_or.reduce(observation.valid, axis=-1) & ~(
             duration < self._shortest
         )  # true at the first frame: its duration is NaN
         known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
         learned = branch(known, self._learn, learned, last, observation, desired, both)
-        if pairing is not None:
-            pair = branch(due & np.logical_not(known), pairing.interrupt, learned.pair)
+        if self.pairing is not None:
+            pair = branch(due & np.logical_not(known), self.pairing.interrupt, learned.pair)
             learned = learned._replace(pair=pair)
-        jacobian = own = self.estimator.jacobian(learned.estimator, q)
-        if pairing is not None and self._cameras is not None:
-            base, jacobian = self._point_jacobian(
-                learned, self._cameras.rates(observation.feature, depth), motions, own, q
-            )
-            learned = learned._replace(pair=learned.pair._replace(base=base))
-        elif pairing is not None:
-            base = own if self.estimator.brings_model else self._given_base(q, learned.pair.base)
-            learned = learned._replace(pair=learned.pair._replace(base=base))
-            if self._model != "own":
-                jacobian = learned.pair.map @ base if self._model == "map" else base
-                jacobian = jacobian + own if self._adds else jacobian
+        own = self.estimator.deviation(learned.estimator, self._first, q)
+        jacobian = own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         last = branch(due, _newest, last, LastFrame(time, q, observation.feature, observation.valid, jacobian))
-        return EstimationState(learned, last, jacobian)
+        return EstimationState(learned, last, jacobian, own)
 
-    def into_model_frame(self, state: EstimationState, observation: Observation) -> FloatArray:
-        """Return T, (..., m, m), that turns measured features into those of the nominal cameras.
+    def ahead(self, state: EstimationState, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return Ĵ by the state at any joint position, (..., n) rad, and the model's J_n there, (..., m, n) each."""
+        learned, q = state.learned, joint_position
+        if self._uses_own:
+            whole: FloatArray = self.estimator.jacobian(learned.estimator, q)
+            return whole, whole
+        nominal = self._given(q, learned.pair.base)
+        own = self.estimator.deviation(learned.estimator, self._first, q)
+        return self._with_model(own, learned, q, nominal), nominal
 
-        With a camera model, T = L Rᵀ L⁺ of each point, whose motion is taken to be across the optical axis.
+    def motion(
+        self, state: EstimationState, begin: FloatArray, joint_step: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
+        """Return the motion of the feature, (..., m), that the state expects of one of the joints.
+
+        Args:
+            state: the state, of which the estimator's own part is that of this period's joint position.
+            begin: (..., n), rad, where it begins.
+            joint_step: (..., n), rad.
+            predicted: J_n Δq along it, (..., m).
         """
-        rotation: FloatArray = state.learned.pair.rotation
-        if self._cameras is None:
-            return rotation.mT
-        depth = self._cameras.depths_and_motions(observation.joint_position)[0]
-        rates = self._cameras.rates(observation.feature, depth)
-        inverse = block_diagonal(np.asarray(np.linalg.pinv(rates)))
-        return np.asarray(turned_interaction(rates, transposed(rotation)) @ inverse)
+        if self._uses_own:
+            return predicted
+        explained = self._explained(state.learned.pair, begin + 0.5 * joint_step, joint_step, predicted)
+        return np.asarray(explained + np.matvec(state.own, joint_step))
 
-    def _depths_and_motions(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return depths (..., c p) [m] and G (..., 3 c p, n) [m/rad]; empty without a camera model."""
-        return (NO_DEPTH, NO_DEPTH) if self._cameras is None else self._cameras.depths_and_motions(joint_position)
+    def into_model_frame(self, state: EstimationState) -> FloatArray:
+        """Return Rᵀ, (..., m, m), that turns measured features into those of the nominal cameras."""
+        rotation: FloatArray = state.learned.pair.regression.rotation
+        return rotation.mT
 
-    def _point_jacobian(
-        self, learned: Learned, rates: FloatArray, motions: FloatArray, own: FloatArray, joint_position: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return G by the present estimate of the arm, and Ĵ."""
-        base = self.estimator.motions(learned.estimator, joint_position)
-        if base is not None:
-            return base, feature_jacobian(rates, learned.pair.map, base)
-        if self._first is not None:
-            own = own - self.estimator.jacobian(self._first, joint_position)
-        return motions, feature_jacobian(rates, learned.pair.map, motions) + own
-
-    def _given_base(self, joint_position: FloatArray, otherwise: FloatArray) -> FloatArray:
+    def _given(self, joint_position: FloatArray, otherwise: FloatArray) -> FloatArray:
         if self._nominal is None:
             return otherwise
         return np.asarray(self._nominal(joint_position), dtype=np.float64)
+
+    def _with_model(
+        self, own: FloatArray, learned: Learned, joint_position: FloatArray, nominal: FloatArray
+    ) -> FloatArray:
+        """Return Ĵ at joint positions, (..., m, n), for the estimator's own part and J_n there."""
+        if self._model == "own" or self.pairing is None:
+            return own
+        if self._model == "regression":
+            nominal = self.pairing.regression.jacobian(learned.pair.regression, joint_position, nominal)
+        return nominal + own
+
+    def _explained(
+        self, pair: PairState, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
+        """Return B Δq, (..., m), at the middle of a motion, for J_n Δq along it."""
+        if self._model == "own" or self.pairing is None:
+            return np.zeros_like(predicted)
+        if self._model == "nominal":
+            return predicted
+        return self.pairing.regression.explained(pair.regression, middle, joint_step, predicted)
 
     def _learn(
         self, learned: Learned, last: LastFrame, observation: Observation, desired: FloatArray, valid: BoolArray
     ) -> Learned:
         """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
         dy, error = observation.feature - last.feature, desired - observation.feature
-        duration = observation.time - last.time
-        if self.pairing is None:
-            q = last.joint_position
-            step = observation.joint_position - q
-            predicted = np.matvec(last.jacobian, step)
-            dy = np.where(valid, dy, predicted)
-            return Learned(
-                self.estimator.update(learned.estimator, Motion(q, step, dy, error, duration)),
-                None,
-                norm(dy - predicted),
-            )
-        middle = 0.5 * (last.feature + observation.feature)
-        pair, paired = self.pairing.learn(learned.pair, dy, duration, middle, valid)
-        predicted = np.matvec(last.jacobian, paired.joint_step)
+        duration, pairing, noise = observation.time - last.time, self.pairing, None
+        q, pair, explained = last.joint_position, learned.pair, np.zeros_like(dy)
+        step = observation.joint_position - q
+        if pairing is not None:
+            before = pair
+            pair, (q, step, x) = pairing.learn(pair, dy, duration, valid)
+            noise = pairing.noise(pair)
+            if self._filters:
+                dy = dy - (pair.regression.mean[..., -1] - before.regression.mean[..., -1])
+            explained = self._explained(before, q + 0.5 * step, step, x)
+            if self._first is not None:
+                explained = explained - np.matvec(self.estimator.jacobian(self._first, q), step)
+        predicted = np.matvec(last.jacobian, step)
         dy = np.where(valid, dy, predicted)
-        motion = self._own_motion(pair, paired, Motion(*paired[:2], dy, error, duration, self.pairing.noise(pair)))
-        known = self.pairing.is_known(pair)
-        return Learned(branch(known, self.estimator.update, learned.estimator, motion), pair, norm(dy - predicted))
-
-    def _own_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
-        """Return the motion without the part that the model explains, for the estimator."""
-        if self._cameras is not None:
-            return self._point_motion(pair, paired, motion)
-        dy, error = motion.feature_step, motion.error
-        if self._model == "map":
-            if self._adds:
-                dy = dy - np.matvec(pair.map, paired.predicted)
-            else:
-                dy, error = np.vecmat(dy, pair.rotation), np.vecmat(error, pair.rotation)
-        elif self._adds:
-            dy = dy - paired.predicted
-        return replace(motion, feature_step=dy, error=error)
-
-    def _point_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
-        rates, x = paired.rates, paired.predicted[..., None]
-        if self._first is None:
-            explained = feature_jacobian(rates, pair.map, x)[..., 0]
-        elif self._estimates_arm:
-            return replace(motion, interaction=turned_interaction(rates, pair.map))
-        else:
-            nominal = self.estimator.jacobian(self._first, motion.joint_position)
-            explained = feature_jacobian(rates, pair.map, x)[..., 0] - np.matvec(nominal, motion.joint_step)
-        return replace(motion, feature_step=motion.feature_step - explained)
+        motion = Motion(q, step, dy - explained, error, duration, noise)
+        return Learned(self.estimator.update(learned.estimator, motion), pair, norm(dy - predicted))
 
     def diagnostics(self, state: EstimationState) -> Diagnostics:
         """Return the diagnostics of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""

@@ -1,49 +1,49 @@
 """The standard deviation of the feature's noise, estimated online from innovations.
 
-    E ‖ν‖²/m = a σ² + b        ν innovation (m,), m; a the multiple of σ² in it; b its other variance, m²
-    sample = (‖ν‖²/m − b)/a,   weight = (a σ²/(a σ² + b))²:   a sample counts less where b is large
-    σ² = Σ weight · sample / Σ weight, with forgetting, from an initial guess that counts as `GUESS_SAMPLES`
+The posterior of σ on a grid of factors of two about a first guess, from innovations ν (K,) of variance a σ² + b, of
+which a part are outliers with a deviation of `OUTLIER`, whatever σ is:
 
-A sample is capped at `MAX_SAMPLE_RATIO` σ², so that a camera that is moved does not pass for noise. During the warm-up
-the cap is higher in proportion, so that a wrong guess is corrected at once.
+    ℓ_j ← f ℓ_j + min(‖ν‖²/s_j + K ln s_j, K ln OUTLIER² + 4.6),   s_j = a σ_j² + b
+    ln σ = Σ μ_j ln σ_j,   μ_j ∝ exp(−ℓ_j/2);   at first ln σ_j ~ N(ln of the guess, 1.5²)
+
+The cap is the density of a contaminated normal distribution: it does not depend on σ, so that neither does a small
+guess pass for certainty, nor an outlier for noise.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 
-GUESS_SAMPLES = 1.0  # [samples] weight of the initial guess
-WARM_UP_SAMPLES = 10.0  # [samples] length of the warm-up, with the guess
-FORGETTING = 0.99  # [1] factor of the sums per sample
-MAX_SAMPLE_RATIO = 9.0  # [1] cap of a sample relative to σ²
-MIN_VARIANCE_RATIO = 1e-2  # [1] floor of σ² relative to the initial guess
+LOG_RATIOS: Final = np.log(2.0) * np.arange(-2, 8)  # [1] ln of σ_j relative to the guess
+LOG_DEVIATION: Final = 1.5  # [1] of ln σ at first
+FORGETTING: Final = 0.99  # [1] f, of the scores per sample
+OUTLIER: Final = 0.1  # [unit of the feature]
+OUTLIER_ODDS: Final = 4.6  # [1] −2 ln of the share of outliers, a tenth
 
 
 class NoiseLevel(NamedTuple):
-    """The state of the estimate; every array is (...).
+    """The state of the estimate.
 
     Attributes:
-        variance: σ², m².
-        weight_sum: Σ weight.
-        sample_sum: Σ weight · sample, m².
-        floor: the lowest σ², m².
+        variance: σ², (...), m².
+        scores: ℓ_j, (..., grid).
+        guess: the first σ², (...), m².
     """
 
     variance: FloatArray
-    weight_sum: FloatArray
-    sample_sum: FloatArray
-    floor: FloatArray
+    scores: FloatArray
+    guess: FloatArray
 
     @classmethod
-    def guess(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
-        """Return the state of an initial guess of σ, m, with leading axes of the shape `lead`."""
-        variance = np.full(lead, deviation**2)
-        return cls(variance, np.full(lead, GUESS_SAMPLES), GUESS_SAMPLES * variance, MIN_VARIANCE_RATIO * variance)
+    def start(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
+        """Return the state of a first guess of σ, m, with leading axes of the shape `lead`."""
+        variance, scores = np.full(lead, deviation**2)[()], np.square(LOG_RATIOS / LOG_DEVIATION)
+        return cls(variance, np.broadcast_to(scores, (*lead, len(scores))), variance)
 
     @property
     def deviation(self) -> FloatArray:
@@ -51,23 +51,26 @@ class NoiseLevel(NamedTuple):
         deviation: FloatArray = np.sqrt(self.variance)
         return deviation
 
-    def learn(self, square: FloatArray, multiple: float | FloatArray, other: FloatArray) -> NoiseLevel:
+    def learn(self, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray) -> NoiseLevel:
         """Return the state after an innovation; one of exactly 0 is that of the same frame and holds no information.
 
         Args:
-            square: ‖ν‖²/m, (...), m².
-            multiple: a, the multiple of σ² in its variance.
+            square: ‖ν‖², (...), m².
+            count: K, (...), number of features in it.
+            multiple: a, (...), of σ² in its variance.
             other: b, (...), the rest of its variance, m².
         """
-        return branch(square != 0.0, _learned, self, square, multiple, other)
+        return branch(square != 0.0, _learned, self, square, count, multiple, other)
 
 
-def _learned(level: NoiseLevel, square: FloatArray, multiple: float | FloatArray, other: FloatArray) -> NoiseLevel:
-    variance, weight_sum, sample_sum, floor = level
-    own = multiple * variance
-    share = own / (own + other)
-    weight = share * share  # not share**2: its bits differ between a number and an array
-    cap = MAX_SAMPLE_RATIO * np.maximum(1.0, WARM_UP_SAMPLES / weight_sum) * variance
-    sample_sum = FORGETTING * sample_sum + weight * np.minimum((square - other) / multiple, cap)
-    weight_sum = FORGETTING * weight_sum + weight
-    return NoiseLevel(np.maximum(sample_sum / weight_sum, floor), weight_sum, sample_sum, floor)
+def _learned(
+    level: NoiseLevel, square: FloatArray, count: FloatArray, multiple: FloatArray, other: FloatArray
+) -> NoiseLevel:
+    own = (multiple * level.guess)[..., None] * np.exp(2.0 * LOG_RATIOS)
+    s, K = own + np.maximum(other, 0.0)[..., None], count[..., None]
+    new = np.minimum(square[..., None] / s + K * np.log(s), K * np.log(OUTLIER**2) + OUTLIER_ODDS)
+    scores = FORGETTING * level.scores + new
+    scores = scores - np.minimum.reduce(scores, axis=-1)[..., None]
+    likelihood = np.exp(np.maximum(-0.5 * scores, -600.0))  # exp of less than −700 underflows
+    mean = np.vecdot(likelihood, LOG_RATIOS) / np.add.reduce(likelihood, axis=-1)
+    return level._replace(variance=level.guess * np.exp(2.0 * mean), scores=scores)

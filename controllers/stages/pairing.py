@@ -1,56 +1,55 @@
-"""The pair stage: delay of the camera, map from model to camera, and noise, identified by a filter bank.
+"""The pair stage: delay of the camera, noise, and the model of the motion, identified by filters side by side.
 
-It pairs each motion of the feature with the joint motion that caused it, and relates a model to the measured features:
+It pairs each motion of the feature with the joint motion that caused it. For each candidate delay d, in periods and not
+always a whole number of them, a filter (`regression`) holds a map M of the nominal Jacobian J_n, and what that leaves
+out; the filter that predicts best has the delay:
 
-    x_d = Σ J_b Δq  over the joint motion that ended d periods ago         J_b the base: a model's Jacobian (m, n)
-    Δy ≈ M x_d                                                             M a map (m, m), of a turned camera
-
-With a camera model, x_d has the motions of the points, and a map turns those of each camera (`point_map`); else a
-map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not always a whole number
-of them, a filter holds a map (a filter bank, or multiple-model estimator); the filter that predicts best has the delay:
-
-    P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← update(x_d, Δy)        for each delay d
+    x_d = Σ J_n Δq  over the joint motion Δq_d that ended d periods ago
+    Δy ≈ M x_d + E Δq_d                          P ← P + diag(w² ‖x_d‖, u² ‖Δq_d‖)
     d = argmin ℓ_d, once it is better than the present one by a margin; motions that tell no delays apart are left out
-    M̄, R = completed(M_d, P_d)
 
-P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
-explains, from which nothing is learned, or a CUSUM of innovations, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
-gate. M stays, as the best guess. The first sample of the noise σ is a guess (`noise_level`).
+E belongs to it: where the model is wrong by more than a map, filters without E take the error for noise, and find the
+delay at which it happens to be smallest. The first sample of the noise σ is a guess (`noise_level`). A regression over
+the motions that the delay pairs then gives the Jacobian.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import Final, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.camera_model import CameraModel
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import in_periods, whole_periods
-from servobench.controllers.stages.camera_map import CameraMap, Step, of_delay
-from servobench.controllers.stages.feature_map import FeatureMap
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.point_map import PointMap
+from servobench.controllers.stages.regression import (
+    Innovation,
+    Regression,
+    RegressionState,
+    fresh_bank,
+    interrupted,
+    learn,
+    of_filter,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, pick
-from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
+from servobench.plant.contract.signals import BoolArray, Observation
 
 MAX_GAP = 16  # longest motion over lost frames from which is learned, in motions of the least length
-MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
-MIN_JUMP_DEVIATIONS = 10.0  # [σ] a longer step is no noise either
 MIN_CHANGE_RATIO = 0.8  # [1] of a motion's change between candidates to noise, above which delays differ
 MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
-NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
-CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
-CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
+NIS_CAP = 50.0  # [1] of ‖ν‖²/s', the normalised innovation squared (NIS), of one motion in the score of a delay
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
+MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
+REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
+REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
+MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
 LAST_THREE = np.array([0, 1, 2])
-NO_DEPTH = np.zeros(0)
 IntArray: TypeAlias = npt.NDArray[np.int_]
-Bank: TypeAlias = Any  # the state of either form of map
 
 
 @final
@@ -104,30 +103,24 @@ class PairState(NamedTuple):
     """The state of the stage.
 
     Attributes:
-        past: [q, Σ x, z] of the last periods, (..., H, n + columns + depths), the newest first.
-        base: J_b, (..., columns, n), of the last period.
-        bank: of the map; see `CameraMap`.
+        past: [q, Σ x] of the last periods, (..., H, n + m), the newest first.
+        base: J_n, (..., m, n), of the last period.
+        bank: of a filter for each delay, (..., D, 2m+n+1, m+n+1).
         scores: ℓ_d, (..., D).
         noise: σ².
         candidate: index of the delay, (...).
-        map: M̄, (..., m, m) or (..., c, 3, 3).
-        rotation: R, likewise.
-        moves: how often the camera seems to have been moved, (...).
-        nis: of the last motion per feature, (...).
-        cusum: C, (...).
+        nis: ‖ν‖²/s of the last motion per feature, (...).
+        regression: over the paired motions.
     """
 
     past: FloatArray
     base: FloatArray
-    bank: Bank
+    bank: FloatArray
     scores: FloatArray
     noise: NoiseLevel
     candidate: IntArray
-    map: FloatArray
-    rotation: FloatArray
-    moves: IntArray
     nis: FloatArray
-    cusum: FloatArray
+    regression: RegressionState
 
 
 class Paired(NamedTuple):
@@ -136,14 +129,12 @@ class Paired(NamedTuple):
     Attributes:
         joint_position: (..., n), rad, where the joint motion began.
         joint_step: Δq, (..., n), rad.
-        predicted: x, (..., columns), the step that the base predicts.
-        rates: L, (..., c, p, k, 3), during it; empty without a camera model.
+        predicted: x = J_n Δq, (..., m).
     """
 
     joint_position: FloatArray
     joint_step: FloatArray
     predicted: FloatArray
-    rates: FloatArray
 
 
 class Past(NamedTuple):
@@ -153,35 +144,38 @@ class Past(NamedTuple):
         delay: d, (...), periods.
         exposed: q(k−d), (..., n), rad.
         before: q(k−d) − q(k−d−1), (..., n), rad.
+        predicted: J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
         window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+        noise: e, (..., m), of the last frame from which was learned.
     """
 
     delay: FloatArray
     exposed: FloatArray
     before: FloatArray
+    predicted: tuple[FloatArray, FloatArray]
     window: FloatArray
+    noise: FloatArray
 
 
 @final
 class Pairing:
-    """Identifies delay, map and noise, each if its aid is on, and pairs motions by the delay.
+    """Identifies delay, noise and the model of the motion, and pairs motions by the delay.
 
     Attributes:
         delays: the candidates, (D,), periods.
-        learns: whether delay, map or noise are identified, for which the base Jacobian predicts motions.
         gap: the longest motion, from one valid feature to the next, of which the past is remembered, periods.
-        maps: the form of the map.
+        regression: the model of the motion.
     """
 
-    def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float, cameras: CameraModel | None = None) -> None:
+    def __init__(self, aids: AidsConfig, knowledge: RobotKnowledge, latency: float) -> None:
         """Take settings, sizes and period.
 
         Args:
             aids: the settings.
-            spec: of the plant.
+            knowledge: of the robot.
             latency: s, of a given delay.
-            cameras: model of the cameras, where a map is to turn the motions of points; None for a map of features.
         """
+        spec = knowledge.spec
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
         if aids.delay == "identified":
@@ -192,43 +186,35 @@ class Pairing:
         self.delays = self._candidates.delays
         self.gap = MAX_GAP * motion
         self._rows = self._candidates.longest + self.gap + 3
-        self._aligns = aids.model == "map"
-        self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
-        self._cameras = cameras
-        self.maps: CameraMap[Any] = FeatureMap(aids, spec.m) if cameras is None else PointMap(aids, cameras, spec.m)
-        self._end = spec.n + self.maps.columns
+        self.regression = Regression(knowledge)
+        self._variances = np.concatenate([np.ones(self._m), np.full(self._n, REST_DEVIATION**2)])
 
-    def start(self, observation: Observation, base: FloatArray, depth: FloatArray = NO_DEPTH) -> PairState:
-        """Return the state of an arm that has rested, with J_b (..., columns, n) and the depths (..., c p) there."""
-        q, lead = observation.joint_position, observation.feature.shape[:-1]
-        none = np.zeros(lead, dtype=np.int_)
-        row = np.concatenate(
-            [q, np.zeros((*lead, self.maps.columns)), np.broadcast_to(depth, (*lead, depth.shape[-1]))], axis=-1
-        )
-        bank, first = self.maps.start(lead, len(self.delays), self._aids.feature_noise**2)
+    def start(self, observation: Observation, base: FloatArray) -> PairState:
+        """Return the state of an arm that has rested, with J_n (..., m, n) there."""
+        q, lead, m = observation.joint_position, observation.feature.shape[:-1], self._m
+        none, frame = np.zeros(lead, dtype=np.int_)[()], self._aids.feature_noise**2
+        row = np.concatenate([q, np.zeros((*lead, m))], axis=-1)
+        bank = fresh_bank(np.eye(m, m + self._n), self._variances, frame)
         return PairState(
             past=np.repeat(row[..., None, :], self._rows, axis=-2),
             base=base,
-            bank=bank,
+            bank=np.broadcast_to(bank, (*lead, len(self.delays), *bank.shape)),
             scores=np.zeros((*lead, len(self.delays))),
-            noise=NoiseLevel.guess(self._aids.feature_noise, lead),
+            noise=NoiseLevel.start(self._aids.feature_noise, lead),
             candidate=none,
-            map=first,
-            rotation=first,
-            moves=none,
-            nis=np.zeros(lead),
-            cusum=np.zeros(lead),
+            nis=np.zeros(lead)[()],
+            regression=self.regression.start(lead, frame),
         )
 
-    def advance(self, state: PairState, joint_position: FloatArray, depth: FloatArray = NO_DEPTH) -> PairState:
-        """Return the state one period later, with the arm at `joint_position` (..., n), rad, and depths (..., c p)."""
-        past, n, end = state.past, self._n, self._end
+    def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
+        """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
+        past, n = state.past, self._n
         new = np.empty_like(past)
         new[..., 1:, :] = past[..., :-1, :]
         new[..., 0, :n] = joint_position
-        new[..., 0, n:end] = past[..., 0, n:end] + np.matvec(state.base, joint_position - past[..., 0, :n])
-        new[..., 0, end:] = depth
-        return state._replace(past=new)
+        mean = 0.5 * (state.base + base)  # of both ends: the error is of third order in the motion
+        new[..., 0, n:] = past[..., 0, n:] + np.matvec(mean, joint_position - past[..., 0, :n])
+        return state._replace(past=new, base=base)
 
     def delay(self, state: PairState) -> FloatArray:
         """Return d, (...), periods."""
@@ -236,22 +222,19 @@ class Pairing:
 
     def past(self, state: PairState, joint_position: FloatArray, window: int) -> Past:
         """Return the past of an arm that is at `joint_position` (..., n), rad; `window` in periods."""
-        positions = state.past[..., : self._n]
-        rows = self._candidates.exposed(positions, state.candidate)
-        before = rows[..., 0, :] - rows[..., 1, :]
-        return Past(self.delay(state), rows[..., 0, :], before, joint_position - positions[..., window, :])
+        n, rows = self._n, self._candidates.exposed(state.past, state.candidate)
+        exposed, before = rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
+        since = state.past[..., 0, :] - exposed
+        moved, noise = joint_position - state.past[..., window, :n], state.regression.mean[..., -1]
+        x = before[..., n:], since[..., n:]
+        return Past(self.delay(state), exposed[..., :n], before[..., :n], x, moved, noise)
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""
         return state.noise.deviation if self._aids.noise == "identified" else None
 
     def learn(
-        self,
-        state: PairState,
-        feature_step: FloatArray,
-        duration: FloatArray,
-        feature: FloatArray,
-        valid: BoolArray,
+        self, state: PairState, feature_step: FloatArray, duration: FloatArray, valid: BoolArray
     ) -> tuple[PairState, Paired]:
         """Return the state after a motion of the feature, and the joint motion that belongs to it.
 
@@ -259,106 +242,81 @@ class Pairing:
             state: with the arm's present position.
             feature_step: Δy, (..., m).
             duration: that it took, (...), s, at most `gap` periods.
-            feature: in the middle of it, (..., m).
-            valid: features that were measured at both ends, (..., m).
+            valid: features that were measured at both ends, (..., m); others are taken to move as foreseen, the noise
+                of their last frame included.
         """
         n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
         begin, end = self._candidates.begins(state.past, periods), self._candidates.ends(state.past)
         passed = end - begin
-        x, depth = passed[..., n : self._end], 0.5 * (begin + end)[..., self._end :]
-        rates = np.zeros((*feature.shape[:-1], 0))
-        if self._cameras is not None:
-            rates = self._cameras.rates(feature[..., None, :], depth)
-        if self.learns:
-            now = state.candidate
-            explained = self.maps.explained(state.map, pick(x, now), self._now(rates, now))
-            step = Step(x, np.where(valid, feature_step, explained), valid, rates)
-            state = self._identify(state, step)
-        now, passed = state.candidate, pick(passed, state.candidate)
-        begin, rates = pick(begin, now)[..., :n], self._now(rates, now)
-        return state, Paired(begin, passed[..., :n], passed[..., n : self._end], rates)
-
-    def _now(self, rates: FloatArray, candidate: IntArray) -> FloatArray:
-        return rates if self._cameras is None else pick(rates, candidate)
+        h = np.concatenate([passed[..., n:], passed[..., :n]], axis=-1)
+        now = pick(state.bank, state.candidate)[..., : self._m, :]
+        foreseen = np.matvec(now[..., :-1], pick(h, state.candidate)) - now[..., -1]
+        state = self._find_delay(state, h, np.where(valid, feature_step, foreseen), valid)
+        begin, passed = pick(begin, state.candidate), pick(passed, state.candidate)
+        paired = Paired(begin[..., :n], passed[..., :n], passed[..., n:])
+        middle = paired.joint_position + 0.5 * paired.joint_step
+        foreseen = self.regression.explained(state.regression, middle, *paired[1:]) - state.regression.mean[..., -1]
+        regression = self.regression.update(
+            state.regression, middle, *paired[1:], np.where(valid, feature_step, foreseen), duration,
+            state.noise.variance,
+        )  # fmt: skip
+        moved = regression.moves > state.regression.moves
+        state = branch(moved, self._forget, state._replace(regression=regression))
+        return state, paired
 
     def interrupt(self, state: PairState) -> PairState:
         """Return the state after a frame at which no motion ended, without information about its noise."""
-        return state._replace(bank=self.maps.interrupted(state.bank, state.noise.variance))
-
-    def is_known(self, state: PairState) -> bool | BoolArray:
-        """Return whether the map, where there is one, is known well enough to learn with it, (...)."""
-        return not self._aligns or self.deviation(state) < self._aids.confidence
-
-    def deviation(self, state: PairState) -> FloatArray:
-        """Return the uncertainty of the map, (...); see `CameraMap.deviation`."""
-        return self.maps.deviation(of_delay(state.bank, state.candidate), state.rotation)
+        frame = state.noise.variance
+        regression = self.regression.interrupt(state.regression, frame)
+        return state._replace(bank=interrupted(state.bank, frame), regression=regression)
 
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
-        """Return delay (s), rotation (rad), deviation and NIS of the map, moves of the camera, noise level (m)."""
-        found: dict[str, npt.ArrayLike] = {"delay": self.delay(state) * self._period}
-        if self.learns:
-            found |= {"map_surprise": state.nis, "camera_moves": state.moves, "noise_level": state.noise.deviation}
-        if self._aligns:
-            R = state.rotation
-            turned = (R - np.eye(R.shape[-1])).reshape(*R.shape[:-2], -1)
-            angle = np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0))
-            found["map_rotation"] = angle if self._cameras is None else np.maximum.reduce(angle, axis=-1)
-            found["map_deviation"] = self.deviation(state)
-        return found
+        """Return delay [s], noise, NIS, moves of the camera, rotation [rad] of the map, and the deviation of E."""
+        regression, R = state.regression, state.regression.rotation
+        turned = (R - np.eye(self._m)).reshape(*R.shape[:-2], -1)
+        return {
+            "delay": self.delay(state) * self._period,
+            "noise_level": state.noise.deviation,
+            "model_surprise": state.nis,
+            "camera_moves": regression.moves,
+            "map_rotation": np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0)),
+            "model_deviation": self.regression.deviation(regression),
+        }
 
-    def _identify(self, state: PairState, step: Step) -> PairState:
-        lengths = self.maps.lengths(step)
-        if not self._aids.detect_moves:
-            return self._learn_map(state, step, lengths)
-        reach = MIN_JUMP_RATIO * np.maximum.reduce(lengths, axis=-1) + MIN_JUMP_DEVIATIONS * state.noise.deviation
-        jumped = norm(step.feature_step) > reach
-        state = branch(jumped, self._jump, state, step.feature_step)
-        return branch(np.logical_not(jumped), self._learn_map, state, step, lengths)
+    def _forget(self, state: PairState) -> PairState:
+        """Return the state in which any map is possible."""
+        bank = fresh_bank(state.bank[..., : self._m, :-1], self._variances, state.noise.variance[..., None])
+        return state._replace(bank=bank)
 
-    def _jump(self, state: PairState, feature_step: FloatArray) -> PairState:
-        noise, zero = state.noise, np.zeros_like(state.cusum)
-        if self._aids.noise == "identified":
-            noise = noise.learn(np.vecdot(feature_step, feature_step) / self._m, 2.0, zero)
-        bank = self.maps.unknown(state.bank, noise.variance)
-        return state._replace(bank=bank, cusum=zero, moves=state.moves + 1, noise=noise)
-
-    def _learn_map(self, state: PairState, step: Step, lengths: FloatArray) -> PairState:
-        """Update map, covariance and score of every delay, and choose among them."""
-        aids, noise, candidate, frame = self._aids, state.noise, state.candidate, state.noise.variance
-        before = self.maps.walked(state.bank, step, lengths)
-        bank, innovations = self.maps.update(before, step, lengths, frame)
-        now = of_delay(innovations, candidate)
-        surprise = now.nis / np.maximum(np.add.reduce(step.valid, axis=-1), 1)
+    def _find_delay(self, state: PairState, h: FloatArray, feature_step: FloatArray, valid: BoolArray) -> PairState:
+        """Update filter and score of every delay, choose among them, and learn the noise."""
+        aids, m, candidate, frame = self._aids, self._m, state.candidate, state.noise.variance
+        lengths, turns = norm(h[..., :m]), norm(h[..., m:])
+        steps = np.repeat(np.stack([MAP_WALK**2 * lengths, REST_WALK**2 * turns], axis=-1), (m, self._n), axis=-1)
+        model = MODEL_ERROR**2 * (lengths * lengths)
+        learns = lengths * lengths >= frame[..., None]
+        bank, innovations = learn(state.bank, h, feature_step, frame, model, steps, learns)
+        now: Innovation = of_filter(innovations, candidate)
+        noise, count = state.noise, np.add.reduce(valid, axis=-1)
         if aids.noise == "identified":
-            noise = noise.learn(surprise * now.variance, now.frames, now.variance - now.frames * noise.variance)
-        cusum, moves = np.maximum(0.0, state.cusum + np.minimum(surprise, CUSUM_CAP) - CUSUM_DRIFT), state.moves
-        if aids.detect_moves:
-            moved = cusum > aids.move_gate
-            bank = branch(moved, self._learn_any_map, bank, before, step, lengths, frame)
-            cusum, moves = cusum * ~moved, moves + moved
-        counts = self._is_informative(step, lengths, noise)[..., None]
-        scores = aids.score_memory * state.scores + (np.minimum(innovations.nis, NIS_CAP) + innovations.spread) * counts
+            noise = noise.learn(now.square, count, now.frames, now.variance - now.frames * frame)
+        counts = self._is_informative(h, lengths, noise)[..., None]
+        evidence = np.minimum(innovations.square / innovations.capped, NIS_CAP) + m * np.log(innovations.capped)
+        scores = aids.score_memory * state.scores + evidence * counts
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin
         candidate = np.where(better, best, candidate)[()]
-        state = state._replace(
-            bank=bank, scores=scores, noise=noise, candidate=candidate, moves=moves, nis=surprise, cusum=cusum
-        )
-        if not self._aligns:
-            return state
-        nearest, rotation = self.maps.completed(of_delay(bank, candidate), state.rotation)
-        return state._replace(map=nearest, rotation=rotation)
+        nis = now.square / (now.variance * np.maximum(count, 1))
+        return state._replace(bank=bank, scores=scores, noise=noise, candidate=candidate, nis=nis)
 
-    def _is_informative(self, step: Step, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
+    def _is_informative(self, h: FloatArray, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
         """Return whether a motion counts in the scores, (...).
 
         A steady motion hardly differs from one delay to another. The difference is then the noise of single frames,
         which the loop turned into motion, and an error of the model is easily taken for that noise.
         """
-        changes = self.maps.lengths(step._replace(x=step.x - step.x[..., self._candidates.beside, :]))
+        x = h[..., : self._m]
+        changes = norm(x - x[..., self._candidates.beside, :])
         change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))
-        error = self._aids.map_error * length
+        error = MODEL_ERROR * length
         return np.asarray((change >= MIN_CHANGE_RATIO * noise.deviation) | (error < MAX_BIAS_RATIO * noise.deviation))
-
-    def _learn_any_map(self, bank: Bank, before: Bank, step: Step, lengths: FloatArray, frame: FloatArray) -> Bank:
-        return self.maps.update(self.maps.unknown(before, frame), step, lengths, frame)[0]

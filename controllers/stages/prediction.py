@@ -5,14 +5,12 @@
     compared with the reference at k + lead
 
 flight and lead follow from the part of the commands that is still to come (`joint_response`). z is the feature at its
-exposure, d periods ago, as measured or filtered by the motion of the joints between frames (`FeatureFilter`):
+exposure, d periods ago, as measured, or without the noise e that the regression finds in a frame:
 
-    z ← z + Ĵ Δq(k−d),   p ← p + c² ‖Ĵ‖² ‖Δq(k−d)‖²/n + r²        as far as the arm moved until the exposure
-    L = p / (p + σ²),   z ← z + L (y − z),   p ← (1 − L) p               with a valid feature y
+    z ← z + Ĵ Δq(k−d)                               as far as the arm moved until the exposure
+    z = y − e                                       with a valid feature y from which was learned
 
-It is a Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it follow the camera,
-whether or not Ĵ predicts a motion of the feature; at rest it averages: L tends to r/σ. A frame outside the innovation
-gate (a camera that was moved) restarts it. Prediction and filter can each be left out.
+Prediction and filter can each be left out.
 """
 
 from __future__ import annotations
@@ -26,71 +24,15 @@ import numpy as np
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
-from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import whole_periods
+from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.joint_response import WINDOW, JointResponse
-from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
-from servobench.plant.contract.signals import BoolArray, Observation
+from servobench.plant.contract.signals import Observation
 
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
-REST_DRIFT = 4.472136e-4  # [m/√s] process noise of z at rest; r in the formula is that of a period
-RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
-
-
-class FeatureFilter(NamedTuple):
-    """The state of the feature filter, and its steps.
-
-    Attributes:
-        feature: z, (..., m), m.
-        variance: p, (...), m².
-        noise: σ, standard deviation of the feature per axis.
-    """
-
-    feature: FloatArray
-    variance: FloatArray
-    noise: NoiseLevel
-
-    def restart(self, feature: FloatArray) -> FeatureFilter:
-        """Return the filter at a feature y, (..., m), m."""
-        return self._replace(feature=feature, variance=self.noise.variance)
-
-    def advance(self, jacobian: FloatArray, joint_step: FloatArray, model_error: float, period: float) -> FeatureFilter:
-        """Return the filter one period later, before the frame of that period.
-
-        Args:
-            jacobian: Ĵ, (..., m, n), m/rad.
-            joint_step: Δq, (..., n), rad.
-            model_error: c, error of the Jacobian as a share of ‖Ĵ‖, which lasts for `MOTION_TIME`.
-            period: s.
-        """
-        flat = jacobian.reshape(*jacobian.shape[:-2], -1)
-        uncertainty = np.vecdot(flat, flat) * np.vecdot(joint_step, joint_step) / joint_step.shape[-1]
-        error = model_error**2 * (MOTION_TIME / period)
-        return self._replace(
-            feature=self.feature + np.matvec(jacobian, joint_step),
-            variance=self.variance + error * uncertainty + REST_DRIFT**2 * period,
-        )
-
-    def correct(self, feature: FloatArray, valid: BoolArray, find_noise: bool) -> FeatureFilter:
-        """Return the filter after a frame in which at least one feature was measured; the others stay as predicted.
-
-        Args:
-            feature: y, (..., m), m.
-            valid: which of them were measured, (..., m).
-            find_noise: learn σ from y − z.
-        """
-        z, p, noise = self
-        feature = np.where(valid, feature, z)
-        error, innovation_variance = feature - z, p + noise.variance
-        square = np.vecdot(error, error) / np.add.reduce(valid, axis=-1)
-        share = p / innovation_variance
-        if find_noise:
-            noise = noise.learn(square, 1.0, p)
-        corrected = FeatureFilter(z + share[..., None] * error, (1.0 - share) * p, noise)
-        return branch(square > RESTART_RATIO * innovation_variance, FeatureFilter.restart, corrected, feature)
 
 
 class PredictorState(NamedTuple):
@@ -98,13 +40,11 @@ class PredictorState(NamedTuple):
 
     Attributes:
         response: of the joints.
-        filter: of the feature.
-        delay: (...) [periods] of the camera, at which the filter runs; −1 before the first frame.
+        feature: z, (..., m), m.
     """
 
     response: JointResponse
-    filter: FeatureFilter
-    delay: FloatArray
+    feature: FloatArray
 
 
 @final
@@ -125,66 +65,78 @@ class Predictor:
         """
         self._aids, self._period, self._delays = aids, period, delays
         self.window = max(1, whole_periods(WINDOW, period))
+        self._share: float | None = None
         self._length = max(1, whole_periods(aids.response_length, period))
 
-    def frozen(self) -> Predictor:
-        """Return a copy that predicts from a state of this stage with identification switched off."""
+    def frozen(self, share: float) -> Predictor:
+        """Return a copy that predicts from a state of this stage with identification switched off.
+
+        Args:
+            share: of a frame's innovation that is noise, which the filter takes from every frame.
+        """
         aids, other = self._aids, copy.copy(self)
-        other._aids = replace(aids, response=aids.response if aids.response == "ignored" else "given", noise="given")
+        other._aids = replace(aids, response=aids.response if aids.response == "ignored" else "given")
+        other._share = share
         return other
 
     def start(self, observation: Observation) -> PredictorState:
         """Return the state of an arm at rest."""
-        q, y, delays = observation.joint_position, observation.feature, self._delays
-        noise = NoiseLevel.guess(self._aids.feature_noise, y.shape[:-1])
+        q, delays = observation.joint_position, self._delays
         if self._aids.response == "given":
             count = 1 + math.ceil((delays.command_delay + SETTLED_LAGS * delays.lag) / self._period)
             response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
         else:
             response = JointResponse.immediate(self._length, q, self._period, self.window)
-        return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1.0))
+        return PredictorState(response, observation.feature)
 
     def predict(
-        self, state: PredictorState, jacobian: FloatArray, past: Past, observation: Observation
-    ) -> tuple[PredictorState, Observation, FloatArray]:
-        """Return the new state, ŷ and q̂ as the observation that a law gets, and lead, (...) [periods], a fraction."""
-        q, response, lead = observation.joint_position, state.response, np.zeros_like(state.filter.variance)
-        bound = q
+        self, state: PredictorState, stages: Estimation, estimation: EstimationState, observation: Observation
+    ) -> tuple[PredictorState, Observation, FloatArray, FloatArray]:
+        """Return the new state, ŷ and q̂ as the observation that a law gets, lead, (...) [periods], and Ĵ(q̂).
+
+        Args:
+            state: one period ago.
+            stages: pair and estimate stages.
+            estimation: their state of this period.
+            observation: of this period.
+        """
+        q, pairing = observation.joint_position, stages.pairing
+        if pairing is None:
+            raise ValueError("aids: a stage that predicts needs the pair stage")
+        past = pairing.past(estimation.learned.pair, q, self.window)
+        response, bound, lead = state.response, q, np.zeros_like(past.delay)
         if self._aids.response != "ignored":
-            if self._aids.response == "identified":
-                response = response.learn(past.window)
+            response = response.learn(past.window) if self._aids.response == "identified" else response
             bound, lead = q + response.flight(), response.lead
-        found = state.filter._replace(feature=observation.feature)
+        z = observation.feature
         if self._aids.filter:
-            found = self._observe(state, past, jacobian, observation)
-        feature = found.feature + np.matvec(jacobian, bound - past.exposed)
-        return PredictorState(response, found, past.delay), observation.with_values(bound, feature), lead
+            z = self._filtered(state, stages, estimation, past, observation)
+        J, nominal = stages.ahead(estimation, bound)
+        flight = 0.5 * np.matvec(estimation.learned.pair.base + nominal, bound - q)
+        feature = z + stages.motion(estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight)
+        return PredictorState(response, z), observation.with_values(bound, feature), lead, J
+
+    def _filtered(
+        self,
+        state: PredictorState,
+        stages: Estimation,
+        estimation: EstimationState,
+        past: Past,
+        observation: Observation,
+    ) -> FloatArray:
+        """Return z, (..., m), at the exposure."""
+        moved = stages.motion(estimation, past.exposed - past.before, past.before, past.predicted[0])
+        expected, y, noise = state.feature + moved, observation.feature, past.noise
+        learned = np.equal(estimation.last.time, observation.time)
+        if self._share is not None:
+            noise, learned = self._share * (y - expected), np.full_like(learned, fill_value=True)
+        return np.where(learned[..., None] & observation.valid, y - noise, expected)
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
         """Return the state after the joint step (..., n), rad, left the chain."""
         if self._aids.response == "ignored":
             return state
         return state._replace(response=state.response.command(joint_step))
-
-    def _observe(
-        self, state: PredictorState, past: Past, jacobian: FloatArray, observation: Observation
-    ) -> FeatureFilter:
-        """Return the filter at the exposure."""
-        same, y = past.delay == state.delay, observation.feature
-        found = branch(same, self._follow, state.filter, jacobian, past.before, y, observation.valid)
-        return branch(np.logical_not(same), FeatureFilter.restart, found, y)
-
-    def _follow(
-        self,
-        state: FeatureFilter,
-        jacobian: FloatArray,
-        joint_step: FloatArray,
-        feature: FloatArray,
-        valid: BoolArray,
-    ) -> FeatureFilter:
-        state = state.advance(jacobian, joint_step, self._aids.filter_error, self._period)
-        measured = np.logical_or.reduce(valid, axis=-1)
-        return branch(measured, FeatureFilter.correct, state, feature, valid, self._aids.noise == "identified")
 
 
 def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:

@@ -11,7 +11,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
 
-REQUEST = RunRequest("kinematic", "map_mfac", "circle", "moderate", seed=7)
+REQUEST = RunRequest("kinematic", "regression_mfac", "circle", "moderate", seed=7)
 KNOCKED_AT, FUTURE = (40, 120, 200), 80  # [periods]
 ANGLES = np.radians([0.0, 15.0, 30.0, 60.0, 90.0])
 

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from page_studies.cells import by_method, ended_early, quoted, rows_by_method, settled
-from page_studies.study import SIX, Study, Words, settings, sweep
+from page_studies.study import FIVE, Study, Words, settings, sweep
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
@@ -82,7 +82,7 @@ def repeated(options: Words) -> Callable[[Path], Words]:
     def command(folder: Path) -> Words:
         runs = load_runs(folder / RUNS)
         seeds = sorted(set(runs.loc[settling_times(runs).isna(), "seed"]))
-        return sweep("kinematic", SIX, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
+        return sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
 
     return command
 
@@ -144,7 +144,7 @@ FAILURES = Study(
     "failures",
     "how often methods fail in ten million periods, and why",
     25,
-    {RUNS: sweep("kinematic", SIX, "random", "100000:150000")}
+    {RUNS: sweep("kinematic", FIVE, "random", "100000:150000")}
     | {part_of(title): repeated(options) for title, options in CHANGES.items()},
     tables,
     pictures,

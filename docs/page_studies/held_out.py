@@ -15,9 +15,9 @@ from page_studies.study import (
     BETTER,
     BOTH,
     ENGINES,
+    FIVE,
     PUBLISHED,
     RENDERED,
-    SIX,
     SUFFIX,
     Study,
     Words,
@@ -70,7 +70,7 @@ def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
 
 def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield a row for the better method and each of the paper's, both divisions beside each other."""
-    for name in SIX:
+    for name in FIVE:
         row = {"method": cells.quoted(name)}
         for full, words in ((name, ""), (name + SUFFIX, "as published: ")):
             own = runs[runs["controller"] == full]
@@ -158,7 +158,7 @@ def assigned(section: str, values: Mapping[str, Any]) -> Iterator[str]:
 def without(aid: str | None) -> Words:
     """Return the sweep of all methods that have an aid, without it; of all methods as they are for None."""
     names = [
-        name for name in SIX if aid is None or getattr(default_config(find_controller(name)).aids, aid) != LESS[aid]
+        name for name in FIVE if aid is None or getattr(default_config(find_controller(name)).aids, aid) != LESS[aid]
     ]
     less = [f"{name}.aids.{aid}={str(LESS[aid]).lower()}" for name in names if aid]
     return sweep("fmu", names, "random,circle", "48000:48100", "--latency", "0.05", *settings(less))
@@ -170,7 +170,7 @@ def aids_tables(folder: Path) -> dict[str, pd.DataFrame]:
     rows: dict[str, list[dict[str, str]]] = {"aids": [], "aids_circle": []}
     for aid in LESS:
         changed = load_runs(folder / aid)
-        both = {name: cells.changed_and_usual(changed, usual, name) for name in SIX}
+        both = {name: cells.changed_and_usual(changed, usual, name) for name in FIVE}
         for table, measure in zip(rows.values(), (cells.MOVES, cells.CIRCLES), strict=True):
             table.append(
                 {"left out": cells.quoted(aid)}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from page_studies.study import SIX, Study
+from page_studies.study import FIVE, Study
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import folder_figures
 from servobench.harness.pictures.film import draw_frame
@@ -54,7 +54,7 @@ README = Study(
     6,
     {
         "batch": (
-            "compare", "--plants", "bullet", "--controllers", ",".join((*SIX, "calibrated")),
+            "compare", "--plants", "bullet", "--controllers", ",".join((*FIVE, "calibrated")),
             "--tasks", "exp1,exp2,exp3,exp4,circle", "--mismatch", "moderate", "--seeds", "0:1", "--no-report",
         ),
     },

@@ -15,7 +15,7 @@ from servobench.harness.analysis.statistics import is_majority
 from servobench.harness.batch.results import load_runs
 from servobench.harness.studies.robustness import KNOWN_LINES
 
-MAPPED = ("map_mfac", *(name + SUFFIX for name in FOUR))  # best equipped all stay above 90 % everywhere
+MAPPED = ("regression_mfac", *(name + SUFFIX for name in FOUR))  # best equipped all stay above 90 % everywhere
 AXES = "camera_rotation,latency,noise,camera_move"  # those on which methods fail; see the map on `fmu`
 
 

@@ -16,13 +16,13 @@ Tables: TypeAlias = Mapping[str, pd.DataFrame]  # text cells, by name of the tab
 Words: TypeAlias = tuple[str, ...]  # arguments of `servobench`, or a script of this project and its arguments
 Command: TypeAlias = Words | Callable[[Path], Words]
 ENGINES: Final = ("bullet", "mujoco")
-BETTER: Final = "arm_mfac"
+BETTER: Final = "regression_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
-SIX: Final = (BETTER, "map_mfac", *FOUR)
+FIVE: Final = (BETTER, *FOUR)
 PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))  # without any aid, the law as printed
 EQUIPPED: Final = tuple(name for name in METHODS if name not in PUBLISHED)  # with all aids that help it
 BOTH: Final = EQUIPPED + PUBLISHED
-RENDERED: Final = (*SIX, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in SIX))
+RENDERED: Final = (*FIVE, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in FIVE))
 
 
 def nothing(_folder: Path) -> dict[str, Any]:

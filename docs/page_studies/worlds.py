@@ -10,7 +10,7 @@ from typing import Final
 import pandas as pd
 
 from page_studies import cells
-from page_studies.study import BOTH, Study, Words, settings, sweep
+from page_studies.study import BOTH, FIVE, PUBLISHED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of
@@ -26,8 +26,10 @@ MISMATCHES = (
 )
 MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
-WITHOUT = "mfac+constant"  # the map alone
-LEARNERS = (WITHOUT, "mfac+arm", "mfac+ukf", "mfac+rbf", "mfac+true")
+WITHOUT = "mfac+constant"  # the regression alone
+LEARNERS = (WITHOUT, "mfac+ukf", "mfac+rbf", "mfac+true")
+CHALLENGED = (*FIVE, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in FIVE))
+FRESH = "0:200"
 LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
 
 
@@ -67,6 +69,34 @@ def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
                 "settling time, s": cells.settling(move),
             })  # fmt: skip
     return {"learning": pd.DataFrame(rows)}
+
+
+def scored(row: pd.Series[float]) -> str:
+    """Return the mean score of a method in a challenge, and its share of runs that settle or follow."""
+    return f"{row['score']:.2f} ({row['good.value']:.0f} %)"
+
+
+def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return mean scores and shares of good runs, a row a challenge, and the ranking over all challenges."""
+    methods = pd.read_csv(folder / "runs" / "methods.csv")
+    rows = []
+    for (grade, name), runs in methods.groupby(["grade", "challenge"], sort=False):
+        own = runs.set_index("controller")
+        unit = "s" if own["measure"].iloc[0] == "settling" else "mm"
+        row = {"challenge": f"`{name}`", "grade": grade, "reference": f"{own['reference'].iloc[0]:.2f} {unit}"}
+        for method in FIVE:
+            row[cells.quoted(method)] = scored(own.loc[method])
+        best = own.loc[[name for name in CHALLENGED if name.endswith(SUFFIX)]]["score"].idxmax()
+        row["best as published"] = f"{cells.quoted(best.removesuffix(SUFFIX))} {scored(own.loc[best])}"
+        rows.append(row)
+    ranking = pd.read_csv(folder / "runs" / "ranking.csv")
+    ranked = [
+        {"method": cells.quoted(each["controller"]), "rank": str(each["rank"]),
+         "interquartile mean": f"{each['score.value']:.2f} [{each['score.low']:.2f}, {each['score.high']:.2f}]",
+         "lost, %": f"{each['lost, %']:.0f}", **{key: f"{each[key]:.2f}" for key in ranking if "within" in key}}
+        for _, each in ranking.iterrows()
+    ]  # fmt: skip
+    return {"challenges": pd.DataFrame(rows).sort_values("grade", kind="stable"), "ranking": pd.DataFrame(ranked)}
 
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -136,6 +166,25 @@ LEARNING = Study(
         for part, task in (("circles", "circle"), ("moves", "random"))
     },
     learning_table,
+)
+CHALLENGES = Study(
+    "challenges",
+    "every method in every challenge: 200 robots that nothing was tuned or chosen on, 50 with references",
+    25,
+    {
+        "runs": (
+            "suite",
+            "--plants",
+            "kinematic",
+            "--controllers",
+            ",".join(CHALLENGED),
+            "--seeds",
+            FRESH,
+            "--reference-seeds",
+            "50",
+        )
+    },
+    challenges_tables,
 )
 PAIRS_STUDY = Study(
     "pairs",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from servobench.harness.studies.tuning.campaign import Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
-DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
+DEFAULT_CONTROLLERS = "regression_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
 SWEPT = options.Combinations(controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10")
 
 

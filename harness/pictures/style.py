@@ -113,8 +113,7 @@ Styles = dict[str, MethodStyle]
 
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
-    "map_mfac": MethodStyle(WINE, "-", "*"),
-    "arm_mfac": MethodStyle(INDIGO, "-", "H"),
+    "regression_mfac": MethodStyle(WINE, "-", "*"),
     "ukf_mfac": MethodStyle(BLUE, "-", "s"),
     "ukf_mpc": MethodStyle(GREEN, "-", "^"),
     "rbf_pid": MethodStyle(ORANGE, "-", "D"),

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
@@ -16,7 +15,6 @@ from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunSettings
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.hand_eye import RobotModel
@@ -36,16 +34,8 @@ def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: R
         spec=spec,
         preview=run.preview_rows,
         nominal_jacobian=nominal.jacobian,
-        nominal_cameras=_cameras(nominal),
         region=(robot.workspace.lower, robot.workspace.upper),
     )
-
-
-def _cameras(nominal: RobotModel) -> CameraModel | None:
-    """Return how the cameras of a nominal model see points, where its features are those of single points."""
-    if not (isinstance(nominal, SetupModel) and nominal.setup.single and nominal.setup.locate):
-        return None
-    return CameraModel(nominal.setup.cameras, len(nominal.setup.target), nominal.point_motions, nominal.interaction)
 
 
 def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:

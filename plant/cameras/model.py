@@ -29,7 +29,6 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""
-NEAREST: Final = 0.25  # least depth in an interaction matrix, over the planned distance
 MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate are not valid
 
 
@@ -134,24 +133,6 @@ class SetupModel(RobotModel):
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
         turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
         return points, np.swapaxes(turned, -1, -2)
-
-    def interaction(self, feature: FloatArray, depth: FloatArray) -> FloatArray:
-        """Return L, (..., c, p, k, 3): how the k features of each point change with its place in the camera.
-
-        Args:
-            feature: (..., m), of the points.
-            depth: (..., c, p) [m], of the points; at least `NEAREST` of the planned distance is taken.
-
-        Raises:
-            ValueError: the set-up has no such matrix.
-        """
-        setup = self.setup
-        if setup.locate is None or not setup.single:
-            raise ValueError(f"sensing {setup.name} has no interaction matrix: single and locate must be given")
-        points = setup.locate(feature, np.maximum(depth, NEAREST * self.distance), self.optics)
-        along = np.broadcast_to(np.eye(3), (*points.shape, 3))
-        rates = setup.change(points, along, self.optics)
-        return rates.reshape(*points.shape[:-1], -1, 3)
 
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""

@@ -22,7 +22,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from servobench.plant.cameras.optics import Optics, locate, project, project_rates
+from servobench.plant.cameras.optics import Optics, project, project_rates
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import SETTLING_BAND, BoolArray, Channel
 
@@ -30,8 +30,6 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
-Locate: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
-"""Features (..., m), depths (..., c, p) [m] and the optics -> the points that have them, (..., c, p, 3) [m]."""
 DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
 
 
@@ -57,8 +55,6 @@ class SensingSetup:
         unit: of all features, such as "px".
         measure: makes features of points; pure, over leading axes.
         rates: its derivative along motions of the points; None: by central differences.
-        locate: its inverse for points of known depth; None where there is none. With it and `single`, controllers may
-            know how features change with motions of the target, wherever the camera is.
         scale: natural size of a feature, in its unit, for a focal length [px] and a working distance [m]: its change
             with a metre of motion across the optical axis.
         tolerance: the settling band as a share of the scale, for the norm of the error.
@@ -77,7 +73,6 @@ class SensingSetup:
     unit: str
     measure: Measure
     rates: Rates | None = None
-    locate: Locate | None = None
     scale: Callable[[float, float], float] = one
     tolerance: float = SETTLING_BAND
     cameras: int = 1
@@ -126,11 +121,6 @@ def pixel_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Floa
     return rates.reshape(*rates.shape[:-4], -1, rates.shape[-1])
 
 
-def locate_points(features: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
-    """Return the points that have given `pixels`, (..., c, p, 3) m."""
-    return locate(features.reshape(*features.shape[:-1], *depth.shape[-2:], 2), depth, optics)
-
-
 def position(points: FloatArray, optics: Optics) -> FloatArray:
     """Return the first point in the first camera, (..., 3) m."""
     del optics
@@ -148,7 +138,6 @@ in_pixels = partial(
     unit="px",
     measure=pixels,
     rates=pixel_rates,
-    locate=locate_points,
     scale=pixels_per_metre,
     single=True,
 )

@@ -17,11 +17,12 @@ NO_POSTURE = {"aids": {"posture": False}}
 
 @pytest.mark.parametrize(
     ("controller", "settings"),
-    [*((name, {}) for name in PUBLISHED), ("map_mfac", NO_POSTURE)],
+    [*((name, {}) for name in PUBLISHED), ("regression_mfac", NO_POSTURE)],
 )
 def test_predicted_limits_are_those_of_small_motions(controller, settings):
     run = resolve(RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings}))
     predicted, warm = analyse_loop(run), warm_up(run)
     loop = SmallLoop(warm)
-    assert abs(loop.latency_limit() - predicted.latency_limit) <= run.run.period
+    # the loop has the true Jacobian and a limit of whole periods, the prediction the estimated one
+    assert abs(loop.latency_limit() - predicted.latency_limit) <= 2.0 * run.run.period
     assert loop.gain_limit() == pytest.approx(predicted.margins.gain, rel=0.1)

@@ -49,7 +49,7 @@ from servobench.harness.studies.tuning.spaces import (
 CORNERS = 64
 AIDS = {f"aids.{word}" for word in EQUIPPED}
 TUNED = {path.stem: path for path in sorted((Path(controllers.__file__).parent / "tuned").glob("*.toml"))}
-CHECKED = some(TUNED, "map_mfac", "rbfnn_mfac", "rls.published", "constant")
+CHECKED = some(TUNED, "regression_mfac", "rbfnn_mfac", "rls.published", "constant")
 ROUNDING = 0.02  # the curves of ukf_mpc and rbfnn_mfac enlarge it: 0.1.0 differs by so much between two processors
 
 

@@ -1,12 +1,35 @@
-"""Tests of the damped inverse, of the projection on the row space, and of motion in the null space."""
+"""Tests of nearest rotations, the damped inverse, the projection on the row space, and motion in the null space."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from servobench.controllers.algebra import damped_inverse, project_to_row_space
+from servobench.controllers.algebra import damped_inverse, nearest_rotation, project_to_row_space
 from servobench.controllers.stages.finish import step_with_posture
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6))
+def test_the_nearest_rotation_is_that_of_wahbas_problem(seed):
+    M = np.random.default_rng(seed).normal(size=(3, 3))
+    R, _ = Rotation.align_vectors(M.T, np.eye(3))  # Σ ‖M e_i − R e_i‖²
+    np.testing.assert_allclose(nearest_rotation(M), R.as_matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4])
+def test_the_nearest_rotation_is_proper_and_no_other_is_nearer(m):
+    rng = np.random.default_rng(m)
+    for _ in range(20):
+        M = rng.normal(size=(m, m))
+        R = nearest_rotation(M)
+        np.testing.assert_allclose(R.T @ R, np.eye(m), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        skew = 0.01 * rng.normal(size=(m, m))
+        other = R @ np.linalg.qr(np.eye(m) + skew - skew.T)[0]
+        other *= np.sign(np.linalg.det(other)) if m % 2 else 1.0
+        assert np.vdot(R, M) >= np.vdot(nearest_rotation(other), M) - 1e-12
 
 
 def damped_inverse_by_svd(J, damping):

@@ -16,11 +16,11 @@ RESPONSE, GAIN, WEIGHT = (0.0, 0.6, 0.4), 14.0, 1e-9
 
 
 def chain(**aids):
-    """Return `map_mfac` with a gain of 14/s and undamped inverses."""
-    config = METHODS["map_mfac"].config()
+    """Return `regression_mfac` with a gain of 14/s and undamped inverses."""
+    config = METHODS["regression_mfac"].config()
     law = dataclasses.replace(config.law, gain=GAIN, step_weight=WEIGHT)
     aids = AidsConfig(**{**EQUIPPED, "damping": 1e-4, **aids})
-    return METHODS["map_mfac"].build(dataclasses.replace(config, law=law, aids=aids), KNOWLEDGE)
+    return METHODS["regression_mfac"].build(dataclasses.replace(config, law=law, aids=aids), KNOWLEDGE)
 
 
 def still(target):

@@ -23,9 +23,9 @@ KNOWING = dataclasses.replace(
 )
 OTHERS = [
     ("mfac", "broyden", {"delay": "identified", "model": "nominal", "filter": True, "limit": "clip"}),
-    ("pid", "kalman", {"noise": "identified", "model": "map", "rotation_deviation": 0.0, "score_memory": 0.9}),
-    ("pid", "rls", {"response": "given", "delay": "given", "filter": True, "model": "map", "detect_moves": False}),
-    ("mfac", "rbf", {"delay": "identified", "delay_margin": 0.0, "model": "map", "longest_delay": 0.1}),
+    ("pid", "kalman", {"noise": "identified", "model": "regression", "score_memory": 0.9}),
+    ("pid", "rls", {"response": "given", "delay": "given", "filter": True, "model": "regression"}),
+    ("mfac", "rbf", {"delay": "identified", "delay_margin": 0.0, "model": "regression", "longest_delay": 0.1}),
     ("mpc", "cfdl", {"response": "identified", "posture": True}),
 ]
 CHAINS = [

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorder, jacobian_network, only_jacobian, plant_spec
+from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorded, Recorder, jacobian_network, plant_spec
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
+from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator
-from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.plant.contract.signals import Observation
 
@@ -27,39 +27,78 @@ def curved(q):
     return np.stack([1.0 + q[..., 0], np.full(q.shape[:-1], 0.5)], axis=-1)[..., None, :]
 
 
+def two_joints():
+    return RobotKnowledge(plant_spec(2, 1), 0, nominal_jacobian=curved)
+
+
 def two_steps(model, **aids):
-    """Return Ĵ after the motion from q = 0 to (0.1, 0.2), in which the feature moved by 0.4; Ĵ₀ = (1.2, 0.5)."""
-    knowledge = RobotKnowledge(plant_spec(2, 1), 0, nominal_jacobian=curved)
+    """Return stages and state after q = 0 to (0.1, 0.2), in which the feature moved by 0.4; Ĵ₀ = (1.2, 0.5)."""
     broyden = BroydenEstimator(BroydenConfig(step_factor=0.5))
-    stages = Estimation(broyden, knowledge, AidsConfig(model=model, **aids), NONE)
+    stages = Estimation(broyden, two_joints(), AidsConfig(model=model, **aids), NONE)
     looks = [Observation(0.0, [0.0, 0.0], [0.0]), Observation(PERIOD, [0.1, 0.2], [0.4])]
     state = stages.start(looks[0], np.array([[1.2, 0.5]]))
     for look in looks:
         state = stages.update(state, look, np.zeros(1))
     assert stages.diagnostics(state)["jacobian_prediction_error"] == pytest.approx(0.4 - 0.12 - 0.1)
-    return state.jacobian
+    return stages, state
 
 
 def test_its_own_jacobian_by_hand():
     # Δy − Ĵ₀Δq = 0.4 − 0.22 = 0.18, ‖Δq‖² = 0.05: Ĵ = Ĵ₀ + 0.5 · 0.18 / 0.05 · (0.1, 0.2)
-    np.testing.assert_allclose(two_steps("own"), [[1.2 + 0.18, 0.5 + 0.36]])
+    np.testing.assert_allclose(two_steps("own")[1].jacobian, [[1.2 + 0.18, 0.5 + 0.36]])
 
 
-def test_the_deviation_from_the_nominal_jacobian_by_hand():
-    # E₀ = Ĵ₀ − J_n(0) = (0.2, 0); Δy − J_n(0)Δq − E₀Δq = 0.4 − 0.2 − 0.02 = 0.18; J_n(q) = (1.1, 0.5)
-    np.testing.assert_allclose(two_steps("nominal"), [[1.1 + 0.2 + 0.18, 0.5 + 0.36]])
+@pytest.mark.parametrize("model", ["nominal", "regression"])
+def test_the_deviation_from_a_model_by_hand(model):
+    # x = (J_n(0) + J_n(q))/2 Δq = 0.205, E₀ = Ĵ₀ − J_n(0) = (0.2, 0); Δy − x − E₀Δq = 0.4 − 0.205 − 0.02 = 0.175
+    E = np.array([[0.2 + 0.175, 0.35]])
+    stages, state = two_steps(model)
+    B = curved([0.1, 0.2])  # which the regression first changes after this motion
+    if model == "regression":
+        B = stages.pairing.regression.jacobian(state.learned.pair.regression, np.array([0.1, 0.2]), B)
+        assert B[0, 0] > 1.2
+    np.testing.assert_allclose(state.learned.estimator.J, E)
+    np.testing.assert_allclose(state.jacobian, B + E)
+    np.testing.assert_allclose(stages.ahead(state, np.array([0.1, 0.2]))[0], B + E)
 
 
-@pytest.mark.parametrize("confidence", [0.5, 2.0])
-def test_the_map_by_hand(confidence):
-    # x = J_n(0)Δq = 0.2, r = 2 · 0.1² + 0.5² · 0.04 = 0.03, s = r + x² = 0.07, P = 1 − x²/s = 3/7, M = 1 + 0.2 · 0.2/s
-    # M̄ = 1 + (M − 1) · 0.2² / (P + 0.2²); E learns from Δy − M̄x where √P = 0.65 is below the confidence
-    J = two_steps("map", map_error=0.5, feature_noise=0.1, map_walk=0.0, detect_moves=False, confidence=confidence)
-    mapped = 1.0 + 0.04 / 0.07 * 0.04 / (3.0 / 7.0 + 0.04)
-    E = np.array([[0.2, 0.0]])
-    if confidence > 0.65:
-        E = E + 0.5 * (0.4 - mapped * 0.2 - 0.02) / 0.05 * np.array([0.1, 0.2])
-    np.testing.assert_allclose(J, mapped * np.array([[1.1, 0.5]]) + E)
+class Modelled(Recorder):
+    """An estimator that brings the model E(q) = q₀ J, and learns nothing."""
+
+    brings_model = True
+
+    def jacobian(self, state, joint_position):
+        return np.asarray(joint_position)[..., :1, None] * state.J
+
+
+def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_began():
+    """E₀ is that of Ĵ₀ = 0, so that E = q₀ J at first: Ĵ = B + E − E₀, and E learns from Δy − B Δq + E₀ Δq."""
+    q, dq = np.array([0.3, 0.1]), np.array([0.1, 0.2])
+
+    class Started(Modelled):
+        def start(self, jacobian):
+            return Recorded(np.array([[2.0, 1.0]]))
+
+    estimator = Started()
+    stages = Estimation(estimator, two_joints(), AidsConfig(model="nominal"), NONE)
+    state = stages.start(Observation(0.0, q, [0.0]), np.array([[1.2, 0.5]]))
+    state = stages.update(state, Observation(0.0, q, [0.0]), np.zeros(1))
+    np.testing.assert_allclose(state.jacobian, curved(q))
+    state = stages.update(state, Observation(PERIOD, q + dq, [0.4]), np.zeros(1))
+    x, E0 = 1.35 * 0.1 + 0.5 * 0.2, 0.3 * (2.0 * 0.1 + 1.0 * 0.2)
+    np.testing.assert_allclose(estimator.motions[0].feature_step, [0.4 - x + E0])
+    own = Estimation(Started(), two_joints(), AidsConfig(noise="identified"), NONE)
+    begun = own.start(Observation(0.0, q, [0.0]), np.zeros((1, 2)))
+    np.testing.assert_allclose(begun.learned.pair.base, 0.3 * np.array([[2.0, 1.0]]))
+
+
+def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_frames():
+    q, recorder = path(12), Recorder()
+    y = features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))
+    states, _ = follow(recorder, q, y, filter=True)
+    e = np.array([state.learned.pair.regression.mean[:, -1] for state in states])
+    assert np.abs(e[1:]).min(axis=1).all()
+    np.testing.assert_allclose([each.feature_step for each in recorder.motions], np.diff(y - e, axis=0), atol=1e-12)
 
 
 def path(steps, seed=1):
@@ -70,7 +109,8 @@ def path(steps, seed=1):
 
 
 def features(q, turn, network=NETWORK, delay=0):
-    steps = np.matvec(turn @ network.jacobian(q[:-1]), np.diff(q, axis=0))
+    J = network.jacobian(q)
+    steps = np.matvec(turn @ (J[1:] + J[:-1]) / 2.0, np.diff(q, axis=0))
     y = np.concatenate([np.zeros((1, M)), np.cumsum(steps, axis=0)])
     return np.concatenate([np.repeat(y[:1], delay, axis=0), y[: len(y) - delay]])
 
@@ -85,7 +125,7 @@ def follow(estimator, q, y, knowledge=MODELLED, **aids):
     return states, stages
 
 
-@pytest.mark.parametrize("model", ["nominal", "map"])
+@pytest.mark.parametrize("model", ["nominal", "regression"])
 @pytest.mark.parametrize("delay", ["given", "identified"])
 def test_beside_an_exact_model_the_deviation_learns_nothing(model, delay):
     q = path(60)
@@ -99,37 +139,22 @@ def test_beside_an_exact_model_the_deviation_learns_nothing(model, delay):
 
 def test_once_a_turned_camera_is_known_the_deviation_learns_little():
     q = path(150)
-    aids = {"model": "map", "delay": "identified", "confidence": 0.02, "map_error": 0.01}
+    aids = {"model": "regression", "delay": "identified"}
     states, _ = follow(BroydenEstimator(BroydenConfig()), q, features(q, TURN, delay=2), **aids)
     J = TURN @ NETWORK.jacobian(q[-1])
-    assert np.linalg.norm(states[-1].learned.estimator.J) < 0.02 * np.linalg.norm(J)
-    np.testing.assert_allclose(states[-1].jacobian, J, atol=0.02)
+    assert np.linalg.norm(states[-1].learned.estimator.J) < 0.1 * np.linalg.norm(J)
+    np.testing.assert_allclose(states[-1].jacobian, J, atol=0.05)
 
 
-def test_what_no_map_explains_is_left_to_the_deviation():
-    """The last joint's column is wrong in the model: with the deviation Ĵ predicts motions better."""
-    q = path(200)
-    rows = NETWORK.weights.copy()
+def test_the_regression_predicts_where_no_map_explains_and_more_than_the_deviation_learns():
+    """The last joint's column is wrong in the model, and the camera is turned."""
+    q, rows = path(200), NETWORK.weights.copy()
     rows[-1] *= -0.5
-    true = dataclasses.replace(NETWORK, weights=rows)
-    found = []
-    for confidence in (1e-9, 0.5):
-        aids = {"model": "map", "rotation_deviation": 0.0, "confidence": confidence}
-        states, _ = follow(BroydenEstimator(BroydenConfig()), q, features(q, TURN, true), **aids)
+    y, found = features(q, TURN, dataclasses.replace(NETWORK, weights=rows)), []
+    for estimator, model in ((ConstantEstimator(), "regression"), (BroydenEstimator(BroydenConfig()), "nominal")):
+        states, _ = follow(estimator, q, y, model=model)
         found.append(np.mean([state.learned.unexplained for state in states[100:]]))
-    assert found[1] < 0.8 * found[0]
-
-
-def test_an_estimator_with_a_model_learns_in_its_own_frame_what_the_rotation_does_not_explain():
-    q, true = path(400), dataclasses.replace(NETWORK, weights=1.1 * NETWORK.weights)
-    y, found = features(q, TURN, true, delay=1), []
-    for confidence in (0.5, 1e-9):
-        rbf = RbfEstimator(RbfConfig(), KNOWLEDGE, only_jacobian(NETWORK))
-        aids = {"delay": "identified", "rotation_deviation": 0.0, "map_walk": 0.0, "confidence": confidence}
-        states, _ = follow(rbf, q, y, model="map", **aids)
-        wanted = TURN @ true.jacobian(q[-1])
-        found.append(np.linalg.norm(states[-1].jacobian - wanted) / np.linalg.norm(wanted))
-    assert found[0] < 0.7 * found[1]
+    assert found[0] < 0.5 * found[1]
 
 
 @pytest.mark.parametrize("aids", [{}, {"delay": "given"}], ids=["as read", "paired"])
@@ -159,18 +184,12 @@ def test_a_motion_is_paired_with_that_of_the_joints_when_its_frames_were_exposed
     assert len(recorder.motions) == 29
 
 
-def test_a_second_model_is_refused():
-    rbf = RbfEstimator(RbfConfig(), KNOWLEDGE, only_jacobian(NETWORK))
-    with pytest.raises(ValueError, match=r"^aids.model must be 'own' or 'map' for RbfEstimator, which brings a model$"):
-        Estimation(rbf, KNOWLEDGE, AidsConfig(model="nominal"), NONE)
-
-
 def test_without_a_nominal_model_the_first_jacobian_stands_for_it():
     q = path(40)
     J = NETWORK.jacobian(q[0])
     unknown = dataclasses.replace(MODELLED, nominal_jacobian=None)
-    stages = Estimation(BroydenEstimator(BroydenConfig()), unknown, AidsConfig(model="map"), NONE)
+    stages = Estimation(BroydenEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE)
     state, y = stages.start(Observation(0.0, q[0], np.zeros(M)), J), np.matvec(TURN @ J, q)
     for k in range(40):
         state = stages.update(state, Observation(k * PERIOD, q[k], y[k]), np.zeros(M))
-    np.testing.assert_allclose(state.jacobian, TURN @ J, atol=0.03)
+    np.testing.assert_allclose(state.jacobian, TURN @ J, atol=0.08)

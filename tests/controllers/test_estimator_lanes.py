@@ -83,7 +83,7 @@ def test_at_the_start_each_lane_tells_its_own_numbers(name, changes):
         assert estimator.jacobian(state, np.zeros((*lead, N))).shape == J.shape
 
 
-@pytest.mark.parametrize("name", ["kalman", "ukf", "mckf", "rls", "cfdl", "broyden", "arm"])
+@pytest.mark.parametrize("name", ["kalman", "ukf", "mckf", "rls", "cfdl", "broyden"])
 def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
     estimator = made(name, {"min_joint_step": 0.25})
     for length, counts in ((0.25, True), (0.2499, False)):
@@ -106,7 +106,7 @@ def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(name, chang
 
 
 def test_estimators_say_which_of_them_bring_a_model():
-    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov", "arm"}
+    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov"}
 
 
 def test_probing_has_the_same_bits_alone_and_among_others():

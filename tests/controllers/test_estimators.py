@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from kit.toy import Learning, motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
 from servobench.controllers.estimators.constant import ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
@@ -249,7 +248,5 @@ def test_an_estimator_that_lacks_what_it_needs_is_refused():
     knowledge = RobotKnowledge(plant_spec(3, 2), 1)
     with pytest.raises(ValueError, match="true_jacobian must be known for the estimator 'true'"):
         TrueEstimator(TrueConfig(), knowledge)
-    with pytest.raises(ValueError, match="nominal_jacobian must be known for the estimator 'arm'"):
-        ArmEstimator(ArmConfig(), knowledge)
     with pytest.raises(ValueError, match="covariance_limit must be at least initial_covariance"):
         RlsConfig(initial_covariance=2.0, covariance_limit=1.0)

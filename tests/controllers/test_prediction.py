@@ -1,6 +1,7 @@
 """Tests of the predict stage: the joints' response, the feature's filter, the shifted reference."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.joint_response import JointResponse, with_response
-from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.prediction import FeatureFilter, Predictor, shifted
+from servobench.controllers.stages.pairing import Past
+from servobench.controllers.stages.prediction import Predictor, shifted
+from servobench.controllers.stages.regression import REST_DRIFT
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 NO_DELAYS = Delays(0.0, 0.0, 0.0)
@@ -122,70 +124,70 @@ def test_a_window_sees_through_the_steps_of_encoders():
     assert lead == pytest.approx(0.1, abs=0.012)
 
 
-def filter_at(feature, noise=0.001):
-    """Return a filter that starts at a feature."""
-    level = NoiseLevel.guess(noise)
-    return FeatureFilter(np.asarray(feature, dtype=float), level.variance, level)
+class Quadratic:
+    """Pair and estimate stages of the feature y = (q₀², 2 q₁²), with the past of a motion."""
+
+    def __init__(self, past, time):
+        self.pairing, self.kept = self, past
+        pair = SimpleNamespace(base=self.ahead(None, NOW)[0])
+        self.state = SimpleNamespace(learned=SimpleNamespace(pair=pair), last=SimpleNamespace(time=np.float64(time)))
+
+    def past(self, pair, q, window):
+        return self.kept
+
+    def ahead(self, state, q):
+        return np.diag([2.0, 4.0]) * q, np.diag([2.0, 4.0]) * q
+
+    def motion(self, state, begin, joint_step, predicted):
+        return at(begin + joint_step) - at(begin)
 
 
-def test_the_filter_is_a_kalman_filter_by_hand():
-    """σ = 0.1, c = 0.5, ‖Ĵ‖² = 5, ‖Δq‖² = 0.01, r² = 1e-8: p = 0.01 + 0.25·5·0.01/2 = 0.01625, z = 1.2 + L·0.1."""
-    made = filter_at([1.0], 0.1).advance(np.array([[2.0, 1.0]]), np.array([0.1, 0.0]), 0.5, PERIOD)
-    made = made.correct(np.array([1.3]), np.array([True]), False)
-    p = 0.01625 + 1e-8
-    np.testing.assert_allclose(made.feature, [1.2 + p / (p + 0.01) * 0.1])
-    assert made.variance == pytest.approx(p * 0.01 / (p + 0.01))
-    assert made.noise.variance == pytest.approx(0.01)
+def predicted(past, look, feature, learned=True, share=None):
+    """Return ŷ and z of a predictor with the filter, whose state held a feature z."""
+    predictor = Predictor(AidsConfig(delay="given", filter=True), PERIOD, NO_DELAYS)
+    predictor = predictor if share is None else predictor.frozen(share)
+    state, stages = (
+        predictor.start(look)._replace(feature=np.asarray(feature)),
+        Quadratic(past, look.time - (not learned)),
+    )
+    state, ahead, _, J = predictor.predict(state, stages, stages.state, look)
+    np.testing.assert_array_equal(J, np.diag([2.0, 4.0]) * look.joint_position)
+    return ahead.feature, state.feature
 
 
-def test_a_motion_of_which_the_jacobian_sees_nothing_makes_the_filter_unsure_too():
-    before = filter_at([0.0])
-    made = before.advance(np.array([[1.0, 0.0]]), np.array([0.0, 0.1]), 0.2, PERIOD)
-    np.testing.assert_array_equal(made.feature, [0.0])
-    assert made.variance > 100.0 * before.variance
+def at(q):
+    return np.array([q[0] ** 2, 2.0 * q[1] ** 2])
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.008])
-def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints(noise):
-    rng, made, errors = np.random.default_rng(5), filter_at(np.zeros(3)), []
-    for _ in range(900):
-        made = made.advance(np.eye(3), np.zeros(3), 0.2, PERIOD).correct(
-            rng.normal(scale=noise, size=3), np.full(3, True), True
-        )
-        errors.append(made.feature)
-    assert np.sqrt(np.mean(np.square(errors[300:]))) < 1.3 * np.sqrt(0.5 * 1e-4 * noise)  # L = r/σ: σ √(L/2)
-    after = made.advance(np.eye(3), np.array([0.01, 0.0, 0.0]), 0.2, PERIOD)
-    np.testing.assert_allclose(after.feature, made.feature + [0.01, 0.0, 0.0])
+EXPOSED, BEFORE, NOW = np.array([0.5, -0.3]), np.array([0.1, 0.2]), np.array([0.9, 0.4])
+MOVING = Past(np.float64(2.0), EXPOSED, BEFORE, (np.zeros(2), np.zeros(2)), np.zeros(2), np.array([0.03, -0.02]))
+
+
+def test_the_noise_of_its_frame_is_taken_from_a_feature_that_was_learned_from():
+    """Ĵ in the middle of a motion gives that of a quadratic feature exactly."""
+    frame = at(EXPOSED) + MOVING.noise
+    ahead, z = predicted(MOVING, seen(NOW, frame), at(EXPOSED - BEFORE) + 9.0)
+    np.testing.assert_allclose(z, at(EXPOSED))
+    np.testing.assert_allclose(ahead, at(NOW))
+
+
+@pytest.mark.parametrize("missing", ["lost", "not learned from"])
+def test_without_a_frame_the_feature_follows_the_joints_from_the_last_one(missing):
+    look = seen(NOW, at(EXPOSED) + 0.7, valid=missing != "lost")
+    ahead, z = predicted(MOVING, look, at(EXPOSED - BEFORE), learned=missing == "lost")
+    np.testing.assert_allclose(z, at(EXPOSED))
+    np.testing.assert_allclose(ahead, at(NOW))
 
 
 def test_a_feature_that_is_not_seen_follows_the_joints_while_the_others_are_corrected():
-    made = filter_at(np.zeros(2)).advance(np.array([[0.0], [0.5]]), np.array([0.2]), 0.2, PERIOD)
-    made = made.correct(np.array([0.002, 9.0]), np.array([True, False]), True)
-    assert 0.0 < made.feature[0] < 0.002
-    assert made.feature[1] == pytest.approx(0.1)
+    _, z = predicted(MOVING, seen(NOW, [0.8, 0.9], valid=np.array([True, False])), at(EXPOSED - BEFORE))
+    np.testing.assert_allclose(z, [0.8 - 0.03, at(EXPOSED)[1]])
 
 
-def test_a_feature_far_off_restarts_the_filter():
-    made = (
-        filter_at(np.zeros(2))
-        .advance(np.eye(2), np.zeros(2), 0.2, PERIOD)
-        .correct(np.array([0.3, 0.1]), np.full(2, True), True)
-    )
-    np.testing.assert_array_equal(made.feature, [0.3, 0.1])
-    assert made.variance == made.noise.variance
-
-
-@pytest.mark.parametrize("period", [0.025, 0.01])
-def test_in_motion_and_at_rest_the_filter_trusts_a_frame_alike_at_every_rate(period):
-    """The variance after 0.05 s of motion or of rest, without a frame, does not depend on the control period."""
-    for step in (0.02, 0.0):
-        found = []
-        for dt in (0.05, period):
-            made = filter_at(np.zeros(2))
-            for _ in range(round(0.05 / dt)):
-                made = made.advance(np.eye(2), np.array([step, 0.0]) * dt / 0.05, 0.2, dt)
-            found.append(made.variance)
-        assert found[1] == pytest.approx(found[0], rel=1e-9)
+def test_frozen_it_takes_a_share_of_what_it_did_not_expect():
+    frame = at(EXPOSED) + [0.1, -0.2]
+    _, z = predicted(MOVING, seen(NOW, frame), at(EXPOSED - BEFORE), learned=False, share=0.3)
+    np.testing.assert_allclose(z, at(EXPOSED) + 0.7 * np.array([0.1, -0.2]))
 
 
 class Seeing:
@@ -197,16 +199,59 @@ class Seeing:
         self.predictor, self.look = Predictor(config, PERIOD, delays), arm.observe()
         self.estimation, self.state = self.stages.start(self.look, A), self.predictor.start(self.look)
 
-    def predict(self):
-        self.estimation = self.stages.update(self.estimation, self.look, np.zeros(M))
-        pair, pairing = self.estimation.learned.pair, self.stages.pairing
-        past = pairing.past(pair, self.look.joint_position, self.predictor.window)
-        self.state, ahead, self.lead = self.predictor.predict(self.state, A, past, self.look)
+    def predict(self, noise=0.0):
+        look = self.look.with_values(self.look.joint_position, self.look.feature + noise)
+        self.estimation = self.stages.update(self.estimation, look, np.zeros(M))
+        self.state, ahead, self.lead, _ = self.predictor.predict(self.state, self.stages, self.estimation, look)
         return ahead
 
     def send(self, step):
         self.state = self.predictor.note(self.state, step)
         self.look = self.arm.step(step / PERIOD)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.008])
+def test_at_rest_the_filter_averages(noise):
+    """In the steady state z is noisy by σ √(L/2), with the share L = r √T / σ of each frame."""
+    rng, made, errors = np.random.default_rng(5), Seeing(ToyArm(np.eye(M)), noise="identified", filter=True), []
+    for _ in range(900):
+        errors.append(made.predict(rng.normal(scale=noise, size=M)).feature)
+        made.send(np.zeros(N))
+    wanted = np.sqrt(0.5 * REST_DRIFT * np.sqrt(PERIOD) * noise)
+    assert 0.6 * wanted < np.sqrt(np.mean(np.square(errors[300:]))) < 1.4 * wanted
+
+
+def test_in_motion_the_filter_halves_the_noise_and_an_outlier_does_not_pass():
+    found = []
+    for filter_ in (True, False):
+        rng, errors = np.random.default_rng(6), []
+        made = Seeing(ToyArm(np.eye(M)), delay="given", noise="identified", model="regression", filter=filter_)
+        for k in range(200):
+            noise = rng.normal(scale=0.004, size=M)
+            errors.append(made.predict(noise + (0.3 if k == 150 else 0.0)).feature - made.look.feature)
+            made.send(0.01 * np.sin(0.1 * k + np.arange(N)))
+        found.append(
+            (np.sqrt(np.mean(np.square(errors[50:150]))), np.abs(errors[150]).max(), np.abs(errors[151]).max())
+        )
+    (filtered, outlier, after), (measured, whole, _) = found
+    assert filtered < 0.5 * measured
+    assert max(outlier, after) < 0.01 < 0.28 < whole
+
+
+def test_frozen_at_rest_it_filters_as_it_did_when_it_learned():
+    rng, made = np.random.default_rng(5), Seeing(ToyArm(np.eye(M)), filter=True)
+    for _ in range(60):
+        made.predict(rng.normal(scale=1e-3, size=M))
+        made.send(np.zeros(N))
+    still = made.predictor.frozen(float(made.estimation.learned.pair.regression.share))
+    state = made.state
+    for _ in range(10):
+        frame = rng.normal(scale=1e-3, size=M)
+        live = made.predict(frame).feature
+        look = made.look.with_values(made.look.joint_position, frame)
+        state, ahead, _, _ = still.predict(state, made.stages, made.estimation, look)
+        np.testing.assert_allclose(ahead.feature, live, atol=1e-8)
+        made.send(np.zeros(N))
 
 
 @pytest.mark.parametrize("aids", [{"delay": "identified"}, {"delay": "given", "filter": True}], ids=["found", "given"])
@@ -253,22 +298,6 @@ def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     np.testing.assert_allclose(moved[-1], steps.sum(axis=0), atol=1e-5)
 
 
-def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
-    made = Seeing(ToyArm(np.eye(M)), delay="identified", filter=True)
-    for k in range(8):
-        made.predict()
-        made.send(np.full(N, 0.02 * (k + 1)))
-    pair = made.estimation.learned.pair
-    learned = made.estimation.learned._replace(pair=pair._replace(candidate=np.int_(3)))
-    made.estimation = made.estimation._replace(learned=learned)
-    made.look = seen(made.look.joint_position, np.array([0.5, 0.1, -0.2]), valid=False, k=8)
-    pairing, at = made.stages.pairing, made.look.joint_position
-    past = pairing.past(pairing.advance(learned.pair, at), at, 1)
-    bound = made.predict()
-    np.testing.assert_allclose(bound.feature, made.look.feature + A @ (at - past.exposed))
-    assert made.state.delay == made.stages.pairing.delays[3]
-
-
 def test_each_half_alone_makes_up_for_its_part():
     """`delay` brings the feature to the present, `response` to where the commands so far will lead."""
     rng = np.random.default_rng(0)
@@ -295,14 +324,12 @@ def test_the_shifted_reference_is_interpolated_and_goes_on():
     np.testing.assert_allclose(shifted(reference[:1], np.array(1.5), 1), [[0.0]])
 
 
-def test_the_nominal_model_is_asked_only_where_a_stage_predicts_with_it():
-    def count(**aids):
-        asked = []
-        knowledge = replace(KNOWLEDGE, nominal_jacobian=lambda q: asked.append(q) or A)
-        estimation = Estimation(ConstantEstimator(), knowledge, AidsConfig(**aids), NO_DELAYS)
-        state = estimation.start(seen(np.zeros(N), np.zeros(M)), A)
-        estimation.update(state, seen(np.zeros(N), np.zeros(M), k=1), np.zeros(M))
-        return len(asked)
-
-    assert count(filter=True) == count(delay="given") == count(response="identified") == 0
-    assert count(delay="identified") == count(noise="identified") == count(model="nominal") == 2
+@pytest.mark.parametrize(("aids", "asked"), [({}, 1), ({"filter": True}, 4), ({"model": "regression"}, 4)])
+def test_the_nominal_model_is_asked_at_the_start_and_once_a_period_by_the_pair_stage(aids, asked):
+    places = []
+    knowledge = replace(KNOWLEDGE, nominal_jacobian=lambda q: places.append(q) or A)
+    estimation = Estimation(ConstantEstimator(), knowledge, AidsConfig(**aids), NO_DELAYS)
+    state = estimation.start(seen(np.zeros(N), np.zeros(M)), A)
+    for k in range(1, 4):
+        state = estimation.update(state, seen(np.full(N, 0.1 * k), np.zeros(M), k=k), np.zeros(M))
+    assert len(places) == asked

@@ -146,14 +146,14 @@ def test_the_last_stages_change_what_is_sent_and_the_law_notes_it():
 
 
 def test_a_law_of_the_model_works_in_the_frame_of_the_model():
-    """Turning the camera turns what such a law gets not at all, once the camera is known."""
+    """Turning the camera turns what such a law gets not at all, up to the part of the turn that E takes."""
 
     class Trained(Wishing):
         in_model_frame = True
 
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     for law, frame in ((Trained(), np.eye(2)), (Wishing(), turn)):
-        controller, rng, q = servo(ConstantEstimator(), law, {"model": "map"}), np.random.default_rng(0), 0.0
+        controller, rng, q = servo(ConstantEstimator(), law, {"model": "regression"}), np.random.default_rng(0), 0.0
         for k in range(40):
             q = q + 0.05 * rng.normal(size=3)
             y = turn @ J0 @ q
@@ -162,10 +162,10 @@ def test_a_law_of_the_model_works_in_the_frame_of_the_model():
                 controller.reset(look, 0)
             controller.step(look, np.tile(turn @ [0.3, 0.1], (2, 1)))
         J, look, reference = controller.state.law[-2]
-        np.testing.assert_allclose(J, frame @ J0, atol=5e-3)
-        np.testing.assert_allclose(look.feature, frame @ J0 @ q, atol=5e-3)
-        np.testing.assert_allclose(reference, np.tile(frame @ [0.3, 0.1], (2, 1)), atol=5e-3)
-        np.testing.assert_allclose(controller.estimated_jacobian(), turn @ J0, atol=5e-3)
+        np.testing.assert_allclose(J, frame @ J0, atol=0.03)
+        np.testing.assert_allclose(look.feature, frame @ J0 @ q, atol=0.03)
+        np.testing.assert_allclose(reference, np.tile(frame @ [0.3, 0.1], (2, 1)), atol=0.03)
+        np.testing.assert_allclose(controller.estimated_jacobian(), turn @ J0, atol=0.03)
 
 
 def test_the_stages_start_where_the_probing_ends():

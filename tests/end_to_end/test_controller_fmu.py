@@ -21,7 +21,14 @@ from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
 
 PERIOD, N, M = 0.05, 6, 3
-METHODS = ["ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbfnn_mfac"]
+METHODS = [
+    "ukf_mfac:published",
+    "rbf_pid:published",
+    "rbfnn_mfac:published",
+    "regression_mfac",
+    "ukf_mfac",
+    "rbfnn_mfac",
+]
 INPUTS = 0  # value reference of the first input
 
 
@@ -68,8 +75,8 @@ def original(name: str) -> tuple[np.ndarray, np.ndarray]:
     ("name", "version"),
     some(
         list(product(METHODS, (2, 3))),
-        ("ukf_mfac:published", 2), ("rbf_pid:published", 3), ("rbfnn_mfac:published", 2), ("map_mfac", 2),
-        ("map_mfac", 3), ("ukf_mfac", 3),
+        ("ukf_mfac:published", 2), ("rbf_pid:published", 3), ("rbfnn_mfac:published", 2), ("regression_mfac", 2),
+        ("regression_mfac", 3), ("ukf_mfac", 3),
     ),
 )  # fmt: skip
 def test_an_exported_controller_equals_the_original_over_a_run(name, version):
@@ -82,7 +89,7 @@ def test_an_exported_controller_equals_the_original_over_a_run(name, version):
 
 
 @pytest.mark.parametrize(
-    ("name", "version"), some(list(product(METHODS[:4], (2, 3))), ("ukf_mfac:published", 2), ("map_mfac", 3))
+    ("name", "version"), some(list(product(METHODS[:4], (2, 3))), ("ukf_mfac:published", 2), ("regression_mfac", 3))
 )
 def test_fmpy_and_the_reference_run_find_no_problem(name, version):
     assert validate_by_fmpy(str(exported(name, version))) == []
@@ -133,8 +140,8 @@ def test_a_step_of_more_samples_than_anybody_waits_for_is_refused_and_changes_no
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_saved_state_goes_on_with_equal_bits_and_reset_begins_anew(version):
-    inputs, _ = original("map_mfac")
-    with loaded("map_mfac", version) as controller:
+    inputs, _ = original("regression_mfac")
+    with loaded("regression_mfac", version) as controller:
         fmu = controller.fmu
         save, restore = (fmu.getFMUstate, fmu.setFMUstate) if version == 2 else (fmu.getFMUState, fmu.setFMUState)
         before = [controller.answer(k, inputs[k]) for k in range(30)]

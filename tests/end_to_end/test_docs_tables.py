@@ -106,7 +106,7 @@ def test_the_table_of_controllers_has_their_parts_and_aids():
 def short_runs():
     """A short run of each estimator, each law, the aids, and what is no pair."""
     pairs = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS]
-    controllers = [*pairs, "map_mfac", "nmpc_calibrated"]
+    controllers = [*pairs, "regression_mfac", "nmpc_calibrated"]
     settings = read_settings(None, ["exp2.duration=0.2", "run.full_jacobian=true"])
     return [
         run_experiment(RunRequest("kinematic", controller, "exp2", "moderate", 0), settings)

@@ -164,7 +164,7 @@ def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
 
 @pytest.mark.parametrize(
     "loop",
-    [Loop("ukf_mfac:published"), Loop("map_mfac", "ur10e"), Loop("ukf_mfac:published", sensing="pixel")],
+    [Loop("ukf_mfac:published"), Loop("regression_mfac", "ur10e"), Loop("ukf_mfac:published", sensing="pixel")],
     ids=" ".join,
 )
 def test_fmpy_runs_a_system_of_plant_and_controller_as_the_harness_runs_the_loop(loop, tmp_path):

@@ -284,7 +284,7 @@ def test_a_plant_with_a_robot_of_its_own_is_refused(monkeypatch, capsys, tmp_pat
 
 
 def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
-    request = RunRequest("kinematic", "map_mfac", "random", "moderate+camera_move=90deg", 3)
+    request = RunRequest("kinematic", "regression_mfac", "random", "moderate+camera_move=90deg", 3)
     made = run_experiment(request, Settings({"random": {"duration": 2.0}}))
     shown = logged_run(made.row, made.steps, {})
     assert shown.moved_from == 21  # of 40 periods; the move happens during the one before

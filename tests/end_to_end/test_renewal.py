@@ -133,7 +133,7 @@ def test_cells_may_differ_as_rounding_makes_them(found, wanted, same):
 
 
 def test_an_unknown_study_is_one_line_that_names_them_all():
-    with pytest.raises(SystemExit, match="no study is called nonsense; there are held_out, rendered, "):
+    with pytest.raises(SystemExit, match="no study is called nonsense; there are challenges, held_out, rendered, "):
         renewal.main(["nonsense"])
 
 
@@ -194,11 +194,28 @@ def toy_runs(words):
     ])  # fmt: skip
 
 
+def lay_out_suite(folder):
+    """Write the tables of a suite of one challenge with all methods that the study compares."""
+    folder.mkdir()
+    own = {
+        "challenge": "severe",
+        "grade": "I",
+        "measure": "settling",
+        "reference": 0.7,
+        "score": 0.5,
+        "good.value": 99.0,
+    }
+    pd.DataFrame([{**own, "controller": name} for name in worlds.CHALLENGED]).to_csv(folder / "methods.csv")
+    rank = {"rank": 1, "score.value": 0.5, "score.low": 0.4, "score.high": 0.6, "lost, %": 1.0, "within 2×": 0.5}
+    pd.DataFrame([{**rank, "controller": name} for name in worlds.CHALLENGED]).to_csv(folder / "ranking.csv")
+
+
 @pytest.mark.parametrize("module", [held_out, physical, worlds], ids=lambda module: module.__name__)
 def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path, module):
     steps = pd.DataFrame({"error_norm": np.full(50, 0.001)})
     monkeypatch.setattr(module, "load_steps", lambda *_: steps, raising=False)
     shown = "".join(page.read_text() for page in generated_tables.PAGES)
+    lay_out_suite(tmp_path / "runs")
     for study in (value for value in vars(module).values() if isinstance(value, Study) and value.tables is not nothing):
         monkeypatch.setattr(module, "load_runs", lambda path, study=study: toy_runs(study.commands[path.name]))
         for name, table in study.tables(tmp_path).items():

@@ -62,7 +62,7 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(mo
 def test_an_arm_is_the_same_as_fmu_and_in_numpy(name, request):
     robot = name if name == "panda" else request.getfixturevalue(name)
     runs = [
-        run_experiment(RunRequest(plant, "map_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+        run_experiment(RunRequest(plant, "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
         for plant in ("kinematic", "fmu")
     ]
     features = [run.steps.filter(regex="^true_feature_").to_numpy() for run in runs]
@@ -76,7 +76,7 @@ def test_a_rendered_arm_settles_and_can_be_shown(name, request):
     from servobench.harness.pictures.replay import Replay, logged_run
 
     robot = name if name == "panda" else request.getfixturevalue(name)
-    result = run_experiment(RunRequest("bullet", "map_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+    result = run_experiment(RunRequest("bullet", "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
     assert (result.row["outcome"], result.row["reason"]) == ("settled", "")
     shown = logged_run(result.row, result.steps, {})
     with Replay(shown) as replay:

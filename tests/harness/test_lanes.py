@@ -42,7 +42,7 @@ SIDE_BY_SIDE = [name for name in METHODS if METHODS[name].side_by_side]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", some(SIDE_BY_SIDE, "map_mfac", "ukf_mpc", "rbf_pid:published", "rls"))
+@pytest.mark.parametrize("controller", some(SIDE_BY_SIDE, "regression_mfac", "ukf_mpc", "rbf_pid:published", "rls"))
 def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
     assert side_by_side_key(together[0]) is not None

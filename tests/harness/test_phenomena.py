@@ -34,13 +34,13 @@ def test_bounds_are_given_the_kinematics_of_rippled_gears():
 def test_worlds_without_gears_and_tool_are_refused_in_one_line():
     mismatch = Mismatch.parse("moderate+backlash=2deg")
     with pytest.raises(ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"):
-        resolve(RunRequest("mujoco", "map_mfac", "circle", mismatch, 3), Settings())
+        resolve(RunRequest("mujoco", "regression_mfac", "circle", mismatch, 3), Settings())
     with pytest.raises(ConfigurationError, match="an arm is exported without backlash: leave it out, and set"):
-        arm_product(RunRequest("kinematic", "map_mfac", "circle", mismatch, 3), "words")
+        arm_product(RunRequest("kinematic", "regression_mfac", "circle", mismatch, 3), "words")
 
 
 def test_a_run_under_a_turning_camera_is_not_filmed():
-    request = RunRequest("kinematic", "map_mfac", "circle", Mismatch.parse("moderate+camera_turn=15deg"), 3)
+    request = RunRequest("kinematic", "regression_mfac", "circle", Mismatch.parse("moderate+camera_turn=15deg"), 3)
     result = run_experiment(request, Settings())
     with pytest.raises(ConfigurationError, match="cannot be shown: films have no camera that turns"):
         logged_run(result.row, result.steps, {})

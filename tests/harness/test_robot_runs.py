@@ -21,19 +21,19 @@ from servobench.harness.run.tasks import TASKS, fitted
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot.catalogue import find_robot
 
-PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")
+PANDA = RunRequest("kinematic", "regression_mfac", "exp2", "moderate", 3, robot="panda")
 SHORT = Settings({"exp2": {"duration": 3.0}})
 
 
 def test_a_run_of_a_panda_settles_and_says_whose_it_is():
     result = run_experiment(PANDA, SHORT)
     assert (result.row["outcome"], result.row["robot"]) == ("settled", "panda")
-    assert result.row["run_id"] == "kinematic-panda-map_mfac-exp2-moderate-3"
+    assert result.row["run_id"] == "kinematic-panda-regression_mfac-exp2-moderate-3"
     assert sum(name.startswith("joint_position_") for name in result.steps) == 7
 
 
 def test_the_ur5_is_not_named():
-    assert replace(PANDA, robot="ur5").run_id == "kinematic-map_mfac-exp2-moderate-3"
+    assert replace(PANDA, robot="ur5").run_id == "kinematic-regression_mfac-exp2-moderate-3"
     assert [fitted(entry.name, find_robot("ur5")) for entry in TASKS.values()] == [
         each.default for each in TASKS.values()
     ]
@@ -97,7 +97,7 @@ def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
     experiment = build_experiment(request, Settings())
     knowledge = experiment.controller.servo.knowledge
-    assert (knowledge.nominal_jacobian, knowledge.nominal_cameras, knowledge.train) == (None, None, None)
+    assert (knowledge.nominal_jacobian, knowledge.train) == (None, None)
     config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
     assert (config.initial.source, known.initial.source) == ("probe", "nominal")
     assert config.estimator == type(config.estimator)() != known.estimator

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi
 import cv2
 import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS
-from servobench.plant.cameras.model import NEAREST, SetupModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.optics import CAMERA, Optics, in_image, project
 from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
@@ -57,25 +56,6 @@ def test_the_jacobian_is_that_of_casadi_and_of_finite_differences(word):
         columns = [(model.feature(posture + h * e) - model.feature(posture - h * e)) / (2 * h) for e in np.eye(6)]
         np.testing.assert_allclose(np.stack(columns, axis=-1), J, atol=1e-6 * model.channel.scale)
     assert checked >= 1
-
-
-@pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])
-def test_interaction_matrix_and_motions_of_points_make_the_jacobian_of_casadi(word):
-    """J = L(y, z) G(q), with L of the features and their depths alone, through distorted optics."""
-    model = true_model(word)
-    q = symbolic_feature(model)
-    jacobian = casadi.Function("J", [x := casadi.SX.sym("q", 6)], [casadi.jacobian(q(x), x)])
-    for posture in postures(10):
-        points, motions = model.point_motions(posture)
-        if (points[..., 2] < NEAREST * model.distance).any() or not model.valid(posture).all():
-            continue
-        made = model.interaction(model.feature(posture), points[..., 2]) @ motions
-        np.testing.assert_allclose(made.reshape(-1, 6), np.array(jacobian(posture)), rtol=1e-6, atol=1e-6)
-
-
-def test_features_without_an_inverse_have_no_interaction_matrix():
-    with pytest.raises(ValueError, match="position has no interaction matrix: single and locate must be given"):
-        true_model("position:hand").interaction(np.zeros(3), np.ones((1, 1)))
 
 
 @pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])

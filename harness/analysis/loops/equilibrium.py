@@ -72,13 +72,25 @@ class FrozenEstimation:
         self.pairing, self._jacobian = estimation.pairing, jacobian
         self.into_model_frame = estimation.into_model_frame  # of the Jacobian that was learned before
 
+    def ahead(self, state: EstimationState, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the Jacobian at joint positions (..., n), twice; see `Estimation.ahead`."""
+        jacobian = np.broadcast_to(self._jacobian(joint_position), state.jacobian.shape)
+        return jacobian, jacobian
+
+    def motion(
+        self, state: EstimationState, begin: FloatArray, joint_step: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
+        """Return the motion of the feature, which is `predicted`."""
+        del state, begin, joint_step
+        return predicted
+
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; see `Estimation.update`."""
         del desired
         q, learned = observation.joint_position, state.learned
+        jacobian, _ = self.ahead(state, q)
         if self.pairing is not None:
-            learned = learned._replace(pair=self.pairing.advance(learned.pair, q))
-        jacobian = np.broadcast_to(self._jacobian(q), state.jacobian.shape)
+            learned = learned._replace(pair=self.pairing.advance(learned.pair, q, jacobian))
         return state._replace(learned=learned, jacobian=jacobian)
 
 
@@ -90,9 +102,9 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     other, pairing, estimation = copy.copy(servo), servo.estimation.pairing, state.estimation
     estimation = estimation._replace(learned=estimation.learned._replace(estimator=None))  # it may be large
     other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
-    other.predictor = None if servo.predictor is None else servo.predictor.frozen()
     if pairing is not None:
         pair = estimation.learned.pair
+        other.predictor = None if servo.predictor is None else servo.predictor.frozen(float(pair.regression.share))
         window = 0 if servo.predictor is None else servo.predictor.window
         rows = max(int(pairing.delay(pair)) + 3, window + 1)
         learned = estimation.learned._replace(pair=pair._replace(past=pair.past[:rows]))

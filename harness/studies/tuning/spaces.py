@@ -41,7 +41,6 @@ DIGITS: Final = 3  # of a tuned number: more would pretend to a precision that n
 EDGE: Final = 0.05  # [1] share of a box, by factor where it is searched so, within which a value is at its edge
 WIDER: Final = 4.0  # factor by which a box is widened; one with a linear scale gets as much again at its upper end
 LIMITS: Final[Mapping[str, float]] = {
-    "aids.map_error": 0.1,  # with more the identified noise would be too small, and the delay biased
     "law.horizon": 10,  # the preview has no more steps,
     "law.horizon_time": 0.5,  # and is no longer
     "law.k": 1.9,  # below 2, from which on these two diverge
@@ -109,14 +108,6 @@ _CFDL: Final[Space] = {
 }
 
 
-_ARM: Final[Space] = {
-    "estimator.gear_deviation": _log(0.02, 0.5),
-    "estimator.offset_deviation": _log(0.02, 0.5),  # rad
-    "estimator.model_error": _log(0.005, 0.2),
-    "estimator.min_joint_step": _log(0.03, 0.5),  # rad
-}
-
-
 def _aids(without: Collection[str] = ()) -> Space:
     """Return the space of the aids but for those that a law or an estimator brings."""
     return {key: values for key, values in _AIDS.items() if key.removeprefix("aids.") not in without}
@@ -134,8 +125,7 @@ _RBFNN_SWITCHES: Final[Space] = {
 SPACES: Final[Mapping[str, Space]] = {
     "rbfnn_mfac": {**_aids(), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
-    "map_mfac": {**_aids(), **_MFAC},
-    "arm_mfac": {**_aids(), **_MFAC, **_ARM},
+    "regression_mfac": {**_aids(), **_MFAC},
     "ukf_mfac": {**_aids(), **_START, **_MFAC, **_UKF},
     "ukf_mfac:published": {**_MFAC, **_UKF},
     "ukf_mpc": {**_aids({"feedforward", "limit"}), **_START, **_MPC_SWITCHES, **_MPC, **_UKF},

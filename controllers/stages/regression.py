@@ -1,0 +1,324 @@
+"""A linear regression of the feature's motion on the joints' motion, from which the Jacobian follows everywhere.
+
+The nominal Jacobian J_n is wrong by a matrix M (a camera that is turned or at another distance) and by what the arm
+itself differs in, which is expanded to second order about the centre q_c of the working region:
+
+    Δy = M J_n Δq + E Δq + H[r, Δq] + e₊ − e + v              r = q̄ − q_c, q̄ the middle of the motion
+    Ĵ(q) = M J_n(q) + E + H[q − q_c, ·]                       H (m, n, n) symmetric in the joints: y is quadratic in q
+
+e, (m,), is the noise of the frame at which the motion began, e₊ ~ N(0, σ² I) that of the new one, and v ~ N(0, c² ‖Δq‖²
+I) what the model leaves. All unknowns are linear in the regressors h, so that a Kalman filter with one covariance P
+(K, K) for all rows of W = [E H M e] is exact for a given noise (Bayesian linear regression with a walk of W):
+
+    ν = Δy − W h,   s = σ² + (r² T) + c² ‖Δq‖² + hᵀ P h
+    s' = max(s, ‖ν‖²/g),   σ'² = σ² + s' − s                  what exceeds the gate g is taken for noise of this frame
+    W ← W + ν (P h)ᵀ/s',   P ← P − (P h)(P h)ᵀ/s'             but for e:
+    e ← ν σ'²/s',   P_ee ← σ'² (1 − σ'²/s'),   P_We ← −(P h)_W σ'²/s'
+
+Without e the estimate would be biased: a closed loop turns the noise of a frame into joint motion, and the next frame
+undoes it. An outlier goes into its own e, and so back with the next frame. A motion that is too short to tell anything
+changes e only; the rest of P counts in s (a Schmidt-Kalman filter).
+
+How far the arm differs from its model is not known beforehand: filters with several prior deviations of E and H run
+side by side and are weighed by the evidence for each (Bayesian model averaging), from small ones, for which M is near
+a rotation, to large ones, for which the nominal model is hardly more than one regressor of many:
+
+    ℓ_b ← ℓ_b + min(‖ν‖²/s', cap) + m ln s',   μ_b ∝ exp(−ℓ_b/2),   W̄ = Σ μ_b W_b
+
+After three frames in a row that fit nothing but one another, the camera was moved: P returns to the prior.
+All functions are pure; the axis of the filters follows the leading axes of runs side by side.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple, TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.controllers.algebra import nearest_rotation
+from servobench.controllers.controller import RobotKnowledge
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import branch, map_arrays, outer, pick
+from servobench.plant.contract.signals import BoolArray
+
+IntArray: TypeAlias = npt.NDArray[np.int_]
+GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
+NIS_CAP: Final = 30.0  # [1] of ‖ν‖²/s' of one motion in the score of a filter
+LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
+REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
+MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
+MOVED_FRAMES: Final = 3  # frames in a row that fit nothing but one another, after which the camera was moved
+AGREEMENT: Final = 0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
+DEVIATIONS: Final = np.array([0.01, 0.1, 0.4])  # [m/rad] prior deviation of an entry of E; per rad of H
+PRIOR: Final = np.array([0.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
+MODEL_ERROR: Final = 0.02  # [m/rad] c
+WALK: Final = np.array([0.0, 0.1, 0.1])  # [1/√rad] of E and H, as a share of their prior deviation
+MAP_WALK: Final = np.array([0.02, 0.0, 0.0])  # [1/√rad] of M
+ROTATION_DEVIATIONS: Final = np.array([0.1, 0.3])  # [1] ς, of an entry of M from the nearest rotation; then any M
+
+
+class Innovation(NamedTuple):
+    """The innovation of one motion in each of N filters, (..., N) but for ν.
+
+    Attributes:
+        nu: ν, (..., N, m).
+        square: ‖ν‖².
+        variance: s.
+        capped: s'.
+        frames: the multiple of σ² in s.
+    """
+
+    nu: FloatArray
+    square: FloatArray
+    variance: FloatArray
+    capped: FloatArray
+    frames: FloatArray
+
+
+def fresh_bank(W: FloatArray, variances: FloatArray, frame: FloatArray | float) -> FloatArray:
+    """Return filters, [W e] above P, without information about the last frame.
+
+    Args:
+        W: (..., N, m, K−1).
+        variances: of an entry of each column of W, (N, K−1) or (K−1,).
+        frame: σ², (..., 1) or a number.
+
+    Returns:
+        (..., N, m+K, K).
+    """
+    m, k = W.shape[-2:]
+    bank = np.zeros((*W.shape[:-2], m + k + 1, k + 1))
+    bank[..., :m, :k], bank[..., -1, -1] = W, frame
+    bank[..., m:-1, :k] = variances[..., None] * np.eye(k)
+    return bank
+
+
+def interrupted(bank: FloatArray, frame: FloatArray) -> FloatArray:
+    """Return filters without information about the noise of the last frame, σ² (...)."""
+    bank = bank.copy()
+    bank[..., -1], bank[..., -1, :] = 0.0, 0.0
+    bank[..., -1, -1] = frame[..., None]
+    return bank
+
+
+def learn(
+    bank: FloatArray,
+    h: FloatArray,
+    feature_step: FloatArray,
+    frame: FloatArray,
+    model: FloatArray,
+    walk: FloatArray,
+    learns: BoolArray,
+) -> tuple[FloatArray, Innovation]:
+    """Learn from one motion in every filter, as above.
+
+    Args:
+        bank: each [W e] above its P, (..., N, m+K, K), so that one product with h serves both.
+        h: regressors without the −1 of e, (..., N or 1, K−1).
+        feature_step: Δy, (..., m), m.
+        frame: σ², (...), m².
+        model: variance of the motion that the model leaves, (..., N), m².
+        walk: variance that the columns of W gain during the motion, (..., N, K−1).
+        learns: (..., N or 1), whether W is learned; otherwise it is considered only.
+    """
+    m = feature_step.shape[-1]
+    h = np.concatenate([h, np.full((*h.shape[:-1], 1), -1.0)], axis=-1)
+    known = np.matvec(bank, h)
+    known[..., m:-1] += walk * h[..., :-1]
+    Ph = known[..., m:]
+    s = frame[..., None] + model + np.vecdot(h, Ph)
+    known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
+    square = np.vecdot(known[..., :m], known[..., :m])
+    capped = np.maximum(s, square / GATE)
+    noise = frame[..., None] + (capped - s)
+    share = noise / capped
+    gain = Ph / capped[..., None]
+    gain[..., :-1] *= learns[..., None]
+    frames = 1.0 + np.minimum(bank[..., -1, -1] / frame[..., None], 1.0)
+    learned = outer(known, gain)
+    np.subtract(bank, learned, out=learned)  # in place, as a block of a hundred runs is larger than the cache
+    diagonal = learned.reshape(*learned.shape[:-2], -1)[..., m * h.shape[-1] :: h.shape[-1] + 1]
+    diagonal[..., :-1] += walk
+    learned[..., -1] = -share[..., None] * known
+    learned[..., -1, :-1] = learned[..., m:-1, -1]
+    learned[..., -1, -1] = noise * (1.0 - share)
+    return learned, Innovation(-known[..., :m], square, s, capped, frames)
+
+
+def of_filter(tree: Any, index: IntArray) -> Any:  # noqa: ANN401 - any tree
+    """Return the part of one filter of a tree of arrays (..., N, *); `index` is (...)."""
+    return map_arrays(lambda array: pick(array, index), tree)
+
+
+class RegressionState(NamedTuple):
+    """The state of the regression.
+
+    Attributes:
+        bank: of the filters, (..., B, m+K, K).
+        scores: ℓ_b, (..., B).
+        mean: W̄ with e, (..., m, K).
+        share: Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise.
+        rotation: R of the filter with the largest weight of those that have one, (..., m, m).
+        streak: frames in a row that fit nothing but one another, (...).
+        moves: how often the camera seems to have been moved, (...).
+    """
+
+    bank: FloatArray
+    scores: FloatArray
+    mean: FloatArray
+    share: FloatArray
+    rotation: FloatArray
+    streak: IntArray
+    moves: IntArray
+
+
+@final
+class Regression:
+    """Estimates Ĵ(q) and the noise e of the last frame, as above."""
+
+    def __init__(self, knowledge: RobotKnowledge) -> None:
+        """Take the sizes, and the working region, about the centre of which is expanded."""
+        spec = knowledge.spec
+        self._m, self._n = m, n = spec.m, spec.n
+        self._pairs = np.triu_indices(n)
+        lower, upper = knowledge.region or (spec.joint_lower, spec.joint_upper)
+        self._centre: FloatArray = (lower + upper) / 2.0
+        self._map = slice(n + len(self._pairs[0]), n + len(self._pairs[0]) + m)
+        own = np.repeat(DEVIATIONS[:, None] ** 2, self._map.start, axis=1)
+        self._P0 = np.concatenate([own, np.ones((len(DEVIATIONS), m))], axis=1)
+        self._walk = np.concatenate([WALK[:, None] ** 2 * own, np.repeat(MAP_WALK[:, None] ** 2, m, axis=1)], axis=1)
+
+    def start(self, lead: tuple[int, ...], frame: float) -> RegressionState:
+        """Return the state of the nominal model, for the variance σ² of a frame, m²."""
+        m, none = self._m, np.zeros(lead, dtype=np.int_)
+        W = np.zeros((m, self._map.stop))
+        W[:, self._map] = np.eye(m)
+        bank = fresh_bank(np.broadcast_to(W, (len(PRIOR), *W.shape)), self._P0, frame)
+        return RegressionState(
+            np.broadcast_to(bank, (*lead, *bank.shape)),
+            np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
+            np.broadcast_to(np.concatenate([W, np.zeros((m, 1))], axis=1), (*lead, m, self._map.stop + 1)),
+            np.zeros(lead)[()],
+            np.broadcast_to(np.eye(m), (*lead, m, m)),
+            none[()],
+            none[()],
+        )
+
+    def interrupt(self, state: RegressionState, frame: FloatArray) -> RegressionState:
+        """Return the state after a frame at which no motion ended."""
+        mean = state.mean.copy()
+        mean[..., -1] = 0.0
+        return state._replace(bank=interrupted(state.bank, frame), mean=mean, share=np.zeros_like(state.share))
+
+    def update(
+        self,
+        state: RegressionState,
+        middle: FloatArray,
+        joint_step: FloatArray,
+        predicted: FloatArray,
+        feature_step: FloatArray,
+        duration: FloatArray,
+        frame: FloatArray,
+    ) -> RegressionState:
+        """Return the state after a motion.
+
+        Args:
+            state: before.
+            middle: q̄, (..., n), rad.
+            joint_step: Δq, (..., n), rad.
+            predicted: J_n Δq, (..., m), m.
+            feature_step: Δy, (..., m), m.
+            duration: T, (...), s.
+            frame: σ², (...), m².
+        """
+        h = np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+        square = np.vecdot(joint_step, joint_step)
+        moved = square >= MIN_MOTION**2
+        walk = (np.sqrt(square) * moved)[..., None, None] * self._walk
+        model = REST_DRIFT**2 * duration[..., None] + MODEL_ERROR**2 * square[..., None]
+        bank, found = learn(state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None])
+        evidence = np.minimum(found.square / found.capped, NIS_CAP) + self._m * np.log(found.capped)
+        scores = state.scores + evidence * moved[..., None]
+        scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
+        best = scores.argmin(axis=-1)
+        streak = self._streak(state, of_filter(found, best), pick(state.bank[..., : self._m, -1], best))
+        state = state._replace(bank=bank, scores=scores, streak=streak)
+        state = branch(streak >= MOVED_FRAMES, self._forget, state, frame)
+        noise = 1.0 - (found.variance - frame[..., None]) / found.capped
+        return self._combined(state, best, noise)
+
+    def jacobian(self, state: RegressionState, joint_position: FloatArray, nominal: FloatArray) -> FloatArray:
+        """Return Ĵ, (..., m, n), at `joint_position` (..., n), rad, for J_n (..., m, n) there."""
+        n, W = self._n, state.mean
+        H = W[..., n : self._map.start] @ self._quadratic(joint_position)
+        return np.asarray(W[..., self._map] @ nominal + W[..., :n] + H)
+
+    def explained(
+        self, state: RegressionState, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
+        """Return the motion Ĵ Δq, (..., m), of a joint motion; see `update`."""
+        h = np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+        return np.asarray(np.matvec(state.mean[..., :-1], h))
+
+    def deviation(self, state: RegressionState) -> FloatArray:
+        """Return Σ μ_b A_b, (...), m/rad: how far the arm seems to differ from its model."""
+        return np.asarray(np.vecdot(self.weights(state), DEVIATIONS))
+
+    def weights(self, state: RegressionState) -> FloatArray:
+        """Return μ, (..., B)."""
+        likelihood = np.exp(-0.5 * state.scores)
+        return np.asarray(likelihood / np.add.reduce(likelihood, axis=-1)[..., None])
+
+    def _quadratic(self, joint_position: FloatArray) -> FloatArray:
+        """Return the derivatives of the products r_j r_k (j < k) and r_j²/2, (..., n (n+1)/2, n), at r = q − q_c."""
+        first, second = self._pairs
+        r, rows = joint_position - self._centre, np.arange(len(first))
+        derivative = np.zeros((*r.shape[:-1], len(first), self._n))
+        derivative[..., rows, first] = r[..., second]
+        derivative[..., rows, second] = r[..., first]
+        return derivative
+
+    def _streak(self, state: RegressionState, found: Innovation, last: FloatArray) -> IntArray:
+        """Return how many frames in a row do not fit, of which each agrees with the one before.
+
+        Args:
+            state: before the motion.
+            found: by the filter with the largest weight.
+            last: e of the last frame, by that filter.
+        """
+        fits = found.square <= GATE * found.variance
+        alone = found.nu - last  # ν without the noise of the last frame
+        agrees = (np.vecdot(alone, alone) < AGREEMENT * found.square) | (state.streak == 0)
+        return np.asarray(np.where(fits, 0, np.where(agrees, state.streak + 1, 1)))
+
+    def _forget(self, state: RegressionState, frame: FloatArray) -> RegressionState:
+        bank = fresh_bank(state.bank[..., : self._m, :-1], self._P0, frame[..., None])
+        return state._replace(bank=bank, streak=np.zeros_like(state.streak), moves=state.moves + 1)
+
+    def _combined(self, state: RegressionState, best: IntArray, noise: FloatArray) -> RegressionState:
+        """Return the state with W̄, after each M was completed towards the rotation nearest to it.
+
+        With the prior belief that an entry of M is N(R, ς²), and M ~ N(R, P_MM + ς² I) by rows,
+
+            R = argmin ‖(M − R) (P_MM + ς² I)^(−½)‖_F, the rotation nearest to M (P_MM + ς² I)⁻¹
+            W ← W − (M − R) (P_MM + ς² I)⁻¹ P_M
+
+        so that directions count by their certainty: two known directions of three give the third.
+        """
+        m, weights = self._m, self.weights(state)[..., None, None]
+        W, P_M = state.bank[..., :m, :], state.bank[..., m:, :][..., self._map, :]
+        M, P = W[..., self._map], P_M[..., self._map]
+        near = len(ROTATION_DEVIATIONS)
+        M, P, P_M = M[..., :near, :, :], P[..., :near, :, :], P_M[..., :near, :, :]
+        believed = P + (ROTATION_DEVIATIONS**2)[:, None, None] * np.eye(m)
+        try:
+            information = np.linalg.inv(believed)
+        except np.linalg.LinAlgError as error:
+            raise FilterDiverged(f"covariance of the map is singular: {P.tolist()}") from error
+        R = nearest_rotation(M @ information)
+        W = np.concatenate([W[..., :near, :, :] - ((M - R) @ information) @ P_M, W[..., near:, :, :]], axis=-3)
+        mean = np.add.reduce(weights * W, axis=-3)
+        share = np.add.reduce(weights[..., 0, 0] * noise, axis=-1)
+        return state._replace(mean=mean, share=share, rotation=pick(R, np.minimum(best, near - 1)))

@@ -1,0 +1,384 @@
+"""Tests of the regression: batch least squares, likelihoods and means of joint Gaussians, quadratic features."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import softmax
+from scipy.stats import multivariate_normal
+
+from kit.plants import mismatched, nominal_ur5
+from kit.toy import plant_spec
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.stages import regression as stage
+from servobench.controllers.stages.regression import Regression, RegressionState, fresh_bank, interrupted, learn
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import stack, take
+from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
+
+FRAME = 0.49  # σ²
+N, M, PERIOD = 4, 3, 0.05
+QUADRATIC = N + N * (N + 1) // 2  # columns of E and H
+LOWER, UPPER = np.array([-1.0, -0.5, 0.0, 0.2]), np.array([1.0, 0.9, 0.8, 1.0])
+KNOWLEDGE = RobotKnowledge(plant_spec(N, M), 0, region=(LOWER, UPPER))
+TURN = Rotation.from_rotvec([0.4, -0.3, 1.5]).as_matrix()
+
+
+def motions(count, m, seed=0):
+    """Return regressors, motions of the feature, and the variances of the model."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, m)), 0.6 * rng.normal(size=(count, m)), rng.uniform(0.1, 2.0, count)
+
+
+def learned(bank, h, dy, model, frame=FRAME, walk=0.0, learns=True):
+    """Return one filter of a bank after one motion, and its innovation."""
+    made, found = learn(
+        bank[None], h[None], dy, np.float64(frame), np.array([model]), np.full((1, len(h)), walk), np.array([learns])
+    )
+    return made[0], take(found, 0)
+
+
+def filtered(x, dy, model, variance=0.7, frame=FRAME, **options):
+    """Return the bank of one filter, with W = I at first, after motions, and its innovations."""
+    size = x.shape[1]
+    bank, found = fresh_bank(np.eye(size), np.full(size, variance), frame), []
+    for k in range(len(x)):
+        bank, innovation = learned(bank, x[k], dy[k], model[k], frame, **options)
+        found.append(innovation)
+    return bank, stack(found)
+
+
+def moving_average(model, frame=FRAME):
+    """Return the covariance of motions that share their frames."""
+    n = len(model)
+    return np.diag(2.0 * frame + model) - frame * (np.eye(n, k=1) + np.eye(n, k=-1))
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4])
+def test_the_filter_is_generalised_least_squares_around_the_prior(m):
+    x, dy, model = motions(30, m)
+    bank, found = filtered(x, dy, model)
+    assert (found.variance == found.capped).all()
+    information = np.eye(m) / 0.7 + x.T @ np.linalg.solve(moving_average(model), x)
+    np.testing.assert_allclose(np.linalg.inv(bank[m:-1, :-1]), information, rtol=1e-9, atol=1e-9)
+    wanted = np.eye(m) / 0.7 + dy.T @ np.linalg.solve(moving_average(model), x)
+    np.testing.assert_allclose(bank[:m, :m] @ information, wanted, atol=1e-9)
+
+
+def test_the_noise_of_the_last_frame_is_its_mean_given_all_motions():
+    """The frames' noise and W are jointly Gaussian with the motions; so is the covariance of W and e."""
+    x, dy, model = motions(12, 2)
+    bank, _ = filtered(x, dy, model)
+    S = 0.7 * x @ x.T + moving_average(model)
+    shared = FRAME * np.eye(12)[-1]  # covariance of the last frame's noise and the motions
+    np.testing.assert_allclose(bank[:2, -1], shared @ np.linalg.solve(S, dy - x), atol=1e-12)
+    assert bank[-1, -1] == pytest.approx(FRAME - shared @ np.linalg.solve(S, shared))
+    np.testing.assert_allclose(bank[2:-1, -1], -0.7 * x.T @ np.linalg.solve(S, shared), atol=1e-12)
+    np.testing.assert_allclose(bank[2:], bank[2:].T, rtol=1e-12)
+
+
+def test_the_scores_are_the_likelihood_of_the_motions():
+    """Under W ~ N(I, 0.7) the motions of an axis are normal with the covariance 0.7 X Xᵀ + that of the frames."""
+    x, dy, model = motions(25, 2)
+    _, found = filtered(x, dy, model)
+    score = (found.square / found.capped + 2.0 * np.log(2.0 * np.pi * found.capped)).sum()
+    covariance = 0.7 * x @ x.T + moving_average(model)
+    density = sum(multivariate_normal(x[:, axis], covariance).logpdf(dy[:, axis]) for axis in range(2))
+    np.testing.assert_allclose(score, -2.0 * density, rtol=1e-12)
+
+
+def test_one_update_by_hand_and_every_filter_on_its_own():
+    """s = 1 + 4·2² + 1 = 18 with P_ee = σ² = 1, gain = 4·2/18, ν = 5 − 2 = 3; the other sees x = 0 and s = 2."""
+    bank = fresh_bank(np.ones((2, 1, 1)), np.array([4.0]), 1.0)
+    args = np.array([[2.0], [0.0]]), np.array([5.0]), np.float64(1.0), np.zeros(2), np.zeros((2, 1)), np.array([True])
+    bank, found = learn(bank, *args)
+    np.testing.assert_allclose([found.square, found.variance, found.capped], [[9.0, 25.0], [18.0, 2.0], [18.0, 2.5]])
+    np.testing.assert_array_equal(found.frames, 2.0)
+    np.testing.assert_allclose(bank[0], [[1.0 + 24.0 / 18.0, 3.0 / 18.0], [4.0 - 64.0 / 18.0, -8.0 / 18.0],
+                                         [-8.0 / 18.0, 1.0 - 1.0 / 18.0]])  # fmt: skip
+    # beyond the gate: s' = 25/10, σ'² = 1 + 0.5, e = 5 · 1.5/2.5, P_ee = 1.5 (1 − 1.5/2.5)
+    np.testing.assert_allclose(bank[1], [[1.0, 3.0], [4.0, 0.0], [0.0, 0.6]])
+
+
+def test_motions_that_do_not_count_are_considered_and_teach_nothing_but_the_noise_of_their_frame():
+    """A law that undoes a slow drift of the feature makes steady short motions in which nothing is seen to move."""
+    x, dy, model = motions(6, 2)
+    bank, _ = filtered(x, dy, model)
+    new, found = learned(bank, x[0], dy[0], model[0], learns=False)
+    usual, same = learned(bank, x[0], dy[0], model[0])
+    np.testing.assert_array_equal(new[:-1, :-1], bank[:-1, :-1])
+    np.testing.assert_array_equal(new[:, -1], usual[:, -1])
+    assert found.variance == same.variance
+    still = np.diff(np.sqrt(FRAME) * np.random.default_rng(6).normal(size=401))[:, None]
+    short = np.full((400, 1), 0.05)
+    kept, _ = filtered(short, still, np.full(400, 1e-4), learns=False)
+    taught, _ = filtered(short, still, np.full(400, 1e-4))
+    assert kept[0, 0] == 1.0
+    assert kept[1, 0] == 0.7
+    assert taught[0, 0] < 0.5
+
+
+def test_a_motion_that_answers_to_noise_does_not_pass_for_its_cause():
+    """The arm moves by r − g e(k−1) after frame k − 1; frame k shows the motion before. Variance alone says 0."""
+    rng, gain, count = np.random.default_rng(5), 0.5, 600
+    e = rng.normal(size=count + 2)
+    moved = np.sin(0.1 * np.arange(count + 1)) - gain * e[:-1]  # after frame k − 1 was seen
+    dy = moved[:-1] + np.diff(e)[1 : count + 1]
+    candidates = {0: moved[1:], 1: moved[:-1]}
+    assert np.var(dy - candidates[0]) < np.var(dy - candidates[1])
+    scores = {}
+    for delay, x in candidates.items():
+        _, found = filtered(x[:, None], dy[:, None], np.zeros(count), 1e-9, 1.0)
+        scores[delay] = (found.square / found.capped + np.log(found.capped)).sum()
+    assert scores[1] < scores[0] - 20.0
+
+
+def test_without_the_last_frame_a_motion_begins_with_noise_of_which_nothing_is_known():
+    x, dy, model = motions(8, 2)
+    bank, _ = filtered(x, dy, model)
+    cut = interrupted(bank, np.float64(2.0))
+    np.testing.assert_array_equal(cut[:-1, :-1], bank[:-1, :-1])
+    np.testing.assert_array_equal(cut[:, -1], [*np.zeros(4), 2.0])
+    np.testing.assert_array_equal(cut[-1], [*np.zeros(2), 2.0])
+    assert learned(cut, x[0], dy[0], model[0], 2.0)[1].frames == 2.0
+
+
+class Walking:
+    """A regression with the state of one run, and the motions that it got."""
+
+    def __init__(self, knowledge=KNOWLEDGE, sigma=1e-3):
+        self.stage, self.frame = Regression(knowledge), np.float64(sigma**2)
+        self.state, self.seen = self.stage.start((), sigma**2), []
+
+    def move(self, middle, step, x, dy):
+        given = (middle, step, x, dy, np.float64(PERIOD))
+        self.seen.append(given)
+        self.state = self.stage.update(self.state, *given, self.frame)
+        return self
+
+    def follow(self, count, feature, nominal, seed=0, shift=None, size=0.03):
+        """Learn from motions through the region, of which `shift` (count, m) is added to the measured features."""
+        rng = np.random.default_rng(seed)
+        shift = np.sqrt(self.frame) * rng.normal(size=(count + 1, M)) if shift is None else shift
+        for k in range(count):
+            q, step = rng.uniform(LOWER, UPPER), size * rng.normal(size=N)
+            dy = feature(q + step) - feature(q) + shift[k + 1] - shift[k]
+            self.move(q + step / 2, step, nominal @ step, dy)
+        return self
+
+    def jacobian(self, q, nominal):
+        return self.stage.jacobian(self.state, q, nominal)
+
+
+NOMINAL = 0.5 * np.random.default_rng(1).normal(size=(M, N))
+
+
+def quadratic(seed=3):
+    """Return a feature that is quadratic in q, and its coefficients about the centre of the region."""
+    rng = np.random.default_rng(seed)
+    A, B = 0.3 * rng.normal(size=(M, N)), 0.3 * rng.normal(size=(M, N, N))
+    B = B + B.swapaxes(1, 2)
+
+    def feature(q):
+        r = q - (LOWER + UPPER) / 2
+        return TURN @ NOMINAL @ q + A @ r + 0.5 * np.einsum("mjk,j,k->m", B, r, r)
+
+    return feature, A, B[:, *np.triu_indices(N)]
+
+
+def differences(feature, q, h=1e-5):
+    return np.stack([(feature(q + h * e) - feature(q - h * e)) / (2.0 * h) for e in np.eye(len(q))], axis=-1)
+
+
+def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
+    feature, A, B = quadratic()
+    run, rng = Walking(), np.random.default_rng(4)
+    run.state = run.state._replace(mean=np.concatenate([A, B, TURN, np.ones((M, 1))], axis=1))
+    for _ in range(5):
+        q, step = rng.uniform(LOWER, UPPER), rng.normal(size=N)
+        np.testing.assert_allclose(run.jacobian(q, NOMINAL), differences(feature, q), atol=1e-9)
+        explained = run.stage.explained(run.state, q + step / 2, step, NOMINAL @ step)
+        np.testing.assert_allclose(explained, feature(q + step) - feature(q), atol=1e-12)
+
+
+def test_the_jacobian_of_a_quadratic_feature_is_found_in_the_whole_region():
+    feature, *_ = quadratic()
+    run = Walking(sigma=1e-5).follow(100, feature, NOMINAL, size=0.1)
+    for corner in (LOWER, UPPER):
+        error = run.jacobian(corner, NOMINAL) - differences(feature, corner)
+        assert np.linalg.norm(error) < 0.01 * np.linalg.norm(differences(feature, corner) - NOMINAL)
+    assert run.stage.deviation(run.state) == pytest.approx(0.4, rel=0.01)
+
+
+def regressors(middle, step, x):
+    """Return [Δq, the products of r and Δq, x] with products as differences of r_j r_k, or of r_j²/2."""
+    first, second = np.triu_indices(N)
+    begin, end = (middle + sign * step / 2 - (LOWER + UPPER) / 2 for sign in (-1.0, 1.0))
+    products = (end[first] * end[second] - begin[first] * begin[second]) * np.where(first == second, 0.5, 1.0)
+    return np.concatenate([step, products, x])
+
+
+def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypatch):
+    """Each filter says that motions are jointly normal, with a covariance by prior, walk, model and frames."""
+    for name, value in {"MODEL_ERROR": 0.1, "GATE": 1e9, "NIS_CAP": 1e9, "LEAD_CAP": 1e9}.items():
+        monkeypatch.setattr(stage, name, value)
+    run = Walking().follow(14, lambda q: 1.1 * NOMINAL @ q + [0.5 * q[0] * q[1], 0.0, 0.0], NOMINAL)
+    H = np.array([regressors(*each[:3]) for each in run.seen])
+    y = np.array([dy - x for *_, x, dy, _ in run.seen])
+    lengths = np.linalg.norm(H[:, :N], axis=1)
+    walked = np.minimum.outer(np.cumsum(lengths), np.cumsum(lengths))  # what two motions share of the walk
+    odds = -0.5 * stage.PRIOR
+    for b, deviation in enumerate(stage.DEVIATIONS):
+        prior = np.repeat([deviation, 1.0], (QUADRATIC, M)) ** 2
+        walk = np.repeat([stage.WALK[b] * deviation, stage.MAP_WALK[b]], (QUADRATIC, M)) ** 2
+        S = moving_average(stage.REST_DRIFT**2 * PERIOD + (stage.MODEL_ERROR * lengths) ** 2, run.frame)
+        S += H * prior @ H.T + walked * (H * walk @ H.T)
+        odds[b] += multivariate_normal(np.zeros(14), S).logpdf(y.T).sum()
+    np.testing.assert_allclose(run.stage.weights(run.state), softmax(odds), rtol=1e-6)
+    assert run.stage.deviation(run.state) == pytest.approx(softmax(odds) @ stage.DEVIATIONS)
+    assert 0.01 < softmax(odds)[1] < 0.99
+
+
+def test_a_short_motion_changes_the_noise_of_the_frame_and_nothing_else():
+    run = Walking(sigma=3e-3).follow(14, lambda q: NOMINAL @ q, NOMINAL)
+    before = run.state
+    run.follow(1, lambda q: NOMINAL @ q, NOMINAL, size=1e-4, shift=np.array([[0.0] * M, [0.004] * M]))
+    np.testing.assert_array_equal(run.state.bank[:, :-1, :-1], before.bank[:, :-1, :-1])
+    np.testing.assert_array_equal(run.stage.weights(run.state), run.stage.weights(before))
+    assert (run.state.mean[:, -1] > before.mean[:, -1]).all()
+
+
+def test_maps_near_rotations_are_completed_and_all_else_moves_along_as_jointly_gaussian():
+    """Given that M + N(0, ς²) is R, W has its conditional mean; R solves Wahba's problem by the axes of the weight."""
+    run = Walking(sigma=3e-3).follow(6, lambda q: TURN @ NOMINAL @ q, NOMINAL)
+    weights, wanted = softmax(-0.5 * run.state.scores), 0.0
+    for b, bank in enumerate(run.state.bank):
+        W, P = bank[:M], bank[M:]
+        if b == len(stage.ROTATION_DEVIATIONS):
+            wanted = wanted + weights[b] * W
+            break
+        C = np.eye(len(P))[QUADRATIC : QUADRATIC + M]
+        believed = C @ P @ C.T + stage.ROTATION_DEVIATIONS[b] ** 2 * np.eye(M)
+        values, axes = np.linalg.eigh(believed)
+        R, _ = Rotation.align_vectors(axes.T @ (W @ C.T).T, axes.T, 1.0 / values)
+        gain = np.linalg.solve(believed, C @ P)
+        wanted = wanted + weights[b] * (W + (R.as_matrix() - W @ C.T) @ gain)
+        if b == weights.argmax():
+            np.testing.assert_allclose(run.state.rotation, R.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(run.state.mean, wanted, atol=1e-6)
+    assert np.abs(run.state.mean[:, :QUADRATIC] - run.state.bank[0, :M, :QUADRATIC]).max() > 1e-5
+
+
+def test_two_known_directions_of_a_rotation_give_the_third():
+    """Columns of the nominal Jacobian lie in a plane: nothing is seen of motions across it, and the rotation tells."""
+    flat = NOMINAL * [[1.0], [1.0], [0.0]]
+    run = Walking(sigma=1e-4).follow(40, lambda q: TURN @ flat @ q, flat)
+    np.testing.assert_allclose(run.state.rotation, TURN, atol=0.05)
+    assert np.linalg.norm(run.state.bank[0, :M, -2] - TURN[:, 2]) > 0.4
+    np.testing.assert_allclose(run.state.mean[:, QUADRATIC:-1], TURN, atol=0.1)
+
+
+def jumping(shift, count=60):
+    """Return a run that knows a turned camera, and measures features shifted by `shift` (frames, m) from motion 40."""
+    shifts = np.zeros((count + 1, M))
+    shifts[41 : 41 + len(shift)] = shift[: count - 40]
+    return Walking().follow(count, lambda q: TURN @ NOMINAL @ q, NOMINAL, shift=shifts)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_outliers_go_into_the_noise_of_their_frames_and_leave_the_model_alone(frames):
+    outliers = np.array([[0.3, -0.2, 0.1], [-0.2, 0.3, 0.2]])[:frames]
+    run, without = jumping(outliers, 40 + frames), jumping(np.zeros((frames, M)), 40 + frames)
+    np.testing.assert_allclose(run.state.mean[:, -1], outliers[-1], atol=0.03)
+    assert run.state.share > 0.95 > 0.7 > without.state.share
+    run, without = jumping(outliers), jumping(np.zeros((frames, M)))
+    error = np.linalg.norm(without.jacobian(UPPER, NOMINAL) - TURN @ NOMINAL)
+    assert np.linalg.norm(run.jacobian(UPPER, NOMINAL) - without.jacobian(UPPER, NOMINAL)) < error + 0.005
+    assert run.state.moves == without.state.moves == 0
+
+
+def test_three_frames_that_fit_only_one_another_are_a_moved_camera_and_three_outliers_are_not():
+    jump, apart = np.full((20, M), 0.3), 0.3 * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
+    moved = jumping(jump, 43)
+    assert moved.state.moves == 1
+    W = jumping(jump, 42).state.bank[..., :M, :-1]
+    P0 = np.repeat(np.stack([stage.DEVIATIONS**2, np.ones(3)], axis=1), (QUADRATIC, M), axis=1)
+    np.testing.assert_allclose(moved.state.bank[:, :M, :-1], W, atol=0.05)
+    np.testing.assert_array_equal(moved.state.bank[:, M:], [np.diag([*each, moved.frame]) for each in P0])
+    assert (jumping(jump, 42).state.moves, jumping(jump).state.moves) == (0, 1)
+    assert jumping(jump[:2]).state.moves == jumping(apart).state.moves == 0
+
+
+def walked(true, count, sigma, share):
+    """Return the deviation and the relative error of the Jacobian after motions by a share of the way to each goal."""
+    model, rng = nominal_ur5(), np.random.default_rng(0)
+    lower, upper = np.array(TRAINING_LOWER), np.array(TRAINING_UPPER)
+    run = Walking(RobotKnowledge(hand_eye_spec(model, PERIOD, 1.0, 6.0), 0, region=(lower, upper)), sigma)
+    noise, q = sigma * rng.normal(size=(count + 1, 3)), (lower + upper) / 2
+    for k in range(count):
+        if k % 15 == 0:
+            goal = rng.uniform(lower, upper)
+        step = share * (goal - q)
+        dy = true.feature(q + step) - true.feature(q) + noise[k + 1] - noise[k]
+        run.move(q + step / 2, step, model.jacobian(q + step / 2) @ step, dy)
+        q = q + step
+    there = rng.uniform(lower, upper, (20, 6))
+    J, truth = model.jacobian(there), true.jacobian(there)
+    errors = [np.linalg.norm(each - truth) for each in (run.jacobian(there, J), J)]
+    return run.stage.deviation(run.state), errors[0] / errors[1]
+
+
+def test_where_noise_hides_all_but_the_turn_of_the_camera_the_smallest_prior_wins():
+    deviation, error = walked(mismatched("camera_rotation=60deg"), 200, 3e-3, 0.01)
+    assert deviation < 0.02
+    assert error < 0.05
+
+
+def test_the_jacobian_is_learned_where_joint_zeros_are_wrong():
+    model = nominal_ur5()
+    arm = dataclasses.replace(model.arm, joint_offset=np.array([0.0, 0.25, -0.3, 0.2, 0.3, 0.0]))
+    _, error = walked(dataclasses.replace(model, arm=arm), 150, 3e-4, 0.1)
+    assert error < 0.5
+
+
+def test_a_covariance_that_is_singular_is_a_named_fault():
+    run = Walking()
+    bank = run.state.bank.copy()
+    near = len(stage.ROTATION_DEVIATIONS)
+    bank[:near, M + QUADRATIC : -1, QUADRATIC:-1] = -(stage.ROTATION_DEVIATIONS[:, None, None] ** 2) * np.eye(M)
+    run.state = run.state._replace(bank=bank)
+    with pytest.raises(FilterDiverged, match="covariance of the map is singular"):
+        run.move(LOWER, np.zeros(N), np.zeros(M), np.zeros(M))
+
+
+def test_a_lane_has_the_bits_of_a_single_run():
+    """One lane sees outliers, one a moved camera, one short motions; two of them lose the last frame."""
+    rng, made = np.random.default_rng(7), Regression(KNOWLEDGE)
+    steps = 0.05 * rng.normal(size=(40, 3, N))
+    steps[10:20, 2] *= 0.01
+    middles, frames = rng.uniform(LOWER, UPPER, (40, 3, N)), 1e-6 * rng.uniform(0.5, 2.0, (40, 3))
+    x = np.matvec(NOMINAL, steps)
+    dy = np.matvec(np.stack([TURN, np.eye(M), TURN.T]), x) + 1e-3 * rng.normal(size=x.shape)
+    dy[25, 0] += 0.4
+    dy[26, 0] -= 0.4
+    dy[30, 1] += 0.5
+
+    def run(lanes):
+        state = made.start(np.shape(lanes), 1e-6)
+        for k in range(40):
+            given = (each[k, lanes] for each in (middles, steps, x, dy))
+            state = made.update(state, *given, np.full(np.shape(lanes), PERIOD)[()], frames[k, lanes])
+            if k == 33:
+                state = made.interrupt(state, frames[k, lanes])
+        return state
+
+    order = np.array([2, 0, 1])
+    together, permuted = run(np.arange(3)), run(order)
+    assert together.moves.tolist() == [0, 1, 0]
+    for lane in range(3):
+        alone: RegressionState = run(lane)
+        for one, among, other in zip(alone, together, permuted, strict=True):
+            np.testing.assert_array_equal(one, among[lane])
+            np.testing.assert_array_equal(one, other[order.tolist().index(lane)])
