@@ -167,7 +167,9 @@ def stamp(study: Study, folder: Path) -> dict[str, str]:
     """Return how the runs of a study were made."""
     commands = {part: (folder / f"{part}{DONE}").read_text(encoding="utf-8") for part in study.commands}
     carried_out = [part for part, command in commands.items() if command]
-    manifest = read_manifest(folder / carried_out[0])
+    first = folder / carried_out[0]
+    parts = sorted(path.parent for path in first.glob(f"*/{results.MANIFEST}"))  # a suite's, one for each challenge
+    manifest = read_manifest(parts[0] if parts else first)
     return {
         "study": study.name,
         "commit": str(manifest["git_commit"]),
