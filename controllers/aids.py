@@ -61,7 +61,7 @@ class AidsConfig:
     noise: Annotated[Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))] = "given"
     """The standard deviation of the feature, as `feature_noise` or identified."""
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Filter of the feature: what the regression finds to be noise of the last frame is taken from it."""
+    """Filter of the feature: the noise that the regression finds in the last frame is taken from it."""
     model: Annotated[
         Literal["own", "nominal", "regression"], Switch("regression", tuned=("own", "nominal", "regression"))
     ] = "own"

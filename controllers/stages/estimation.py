@@ -20,7 +20,7 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
 from servobench.controllers.periods import whole_periods
-from servobench.controllers.stages.pairing import Pairing, PairState
+from servobench.controllers.stages.pairing import Pairing
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -85,7 +85,7 @@ class Estimation:
 
     def __init__(self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays) -> None:
         """Compose the stages."""
-        self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
+        self.estimator, self._model = estimator, aids.model
         period, self._filters = knowledge.spec.period, aids.filter
         self._shortest = (max(1, whole_periods(MOTION_TIME, period)) - 0.5) * period
         self.pairing = Pairing(aids, knowledge, delays.latency) if aids.needs_past else None
@@ -121,9 +121,8 @@ class Estimation:
             base = self.estimator.jacobian(learned.estimator, q) if self._uses_own else self._given(q, before)
             learned = learned._replace(pair=self.pairing.advance(learned.pair, q, base))
         duration, both = observation.time - last.time, observation.valid & last.valid
-        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(
-            duration < self._shortest
-        )  # true at the first frame: its duration is NaN
+        # not "duration >= shortest": that of the first frame is NaN
+        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)
         known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
         learned = branch(known, self._learn, learned, last, observation, desired, both)
         if self.pairing is not None:
@@ -159,8 +158,13 @@ class Estimation:
         """
         if self._uses_own:
             return predicted
-        explained = self._explained(state.learned.pair, begin + 0.5 * joint_step, joint_step, predicted)
-        return np.asarray(explained + np.matvec(state.own, joint_step))
+        own, pair = np.matvec(state.own, joint_step), state.learned.pair
+        if self._model == "nominal":
+            return np.asarray(predicted + own)
+        if self._model == "own" or self.pairing is None:
+            return np.asarray(own)
+        h = self.pairing.regression.regressors(begin + 0.5 * joint_step, joint_step, predicted)
+        return np.asarray(self.pairing.regression.explained(pair.regression, h) + own)
 
     def into_model_frame(self, state: EstimationState) -> FloatArray:
         """Return Rᵀ, (..., m, m), that turns measured features into those of the nominal cameras."""
@@ -182,16 +186,6 @@ class Estimation:
             nominal = self.pairing.regression.jacobian(learned.pair.regression, joint_position, nominal)
         return nominal + own
 
-    def _explained(
-        self, pair: PairState, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
-    ) -> FloatArray:
-        """Return B Δq, (..., m), at the middle of a motion, for J_n Δq along it."""
-        if self._model == "own" or self.pairing is None:
-            return np.zeros_like(predicted)
-        if self._model == "nominal":
-            return predicted
-        return self.pairing.regression.explained(pair.regression, middle, joint_step, predicted)
-
     def _learn(
         self, learned: Learned, last: LastFrame, observation: Observation, desired: FloatArray, valid: BoolArray
     ) -> Learned:
@@ -202,11 +196,12 @@ class Estimation:
         step = observation.joint_position - q
         if pairing is not None:
             before = pair
-            pair, (q, step, x) = pairing.learn(pair, dy, duration, valid)
+            pair, (q, step, x, h) = pairing.learn(pair, dy, duration, valid)
             noise = pairing.noise(pair)
             if self._filters:
                 dy = dy - (pair.regression.mean[..., -1] - before.regression.mean[..., -1])
-            explained = self._explained(before, q + 0.5 * step, step, x)
+            if self._model != "own":
+                explained = x if self._model == "nominal" else pairing.regression.explained(before.regression, h)
             if self._first is not None:
                 explained = explained - np.matvec(self.estimator.jacobian(self._first, q), step)
         predicted = np.matvec(last.jacobian, step)

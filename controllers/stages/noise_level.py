@@ -1,7 +1,7 @@
 """The standard deviation of the feature's noise, estimated online from innovations.
 
 The posterior of σ on a grid of factors of two about a first guess, from innovations ν (K,) of variance a σ² + b, of
-which a part are outliers with a deviation of `OUTLIER`, whatever σ is:
+which a part are outliers with a deviation of `OUTLIER`, which does not depend on σ:
 
     ℓ_j ← f ℓ_j + min(‖ν‖²/s_j + K ln s_j, K ln OUTLIER² + 4.6),   s_j = a σ_j² + b
     ln σ = Σ μ_j ln σ_j,   μ_j ∝ exp(−ℓ_j/2);   at first ln σ_j ~ N(ln of the guess, 1.5²)

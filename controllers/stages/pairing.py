@@ -1,8 +1,8 @@
 """The pair stage: delay of the camera, noise, and the model of the motion, identified by filters side by side.
 
 It pairs each motion of the feature with the joint motion that caused it. For each candidate delay d, in periods and not
-always a whole number of them, a filter (`regression`) holds a map M of the nominal Jacobian J_n, and what that leaves
-out; the filter that predicts best has the delay:
+always a whole number of them, a filter (`regression`) holds a map M of the nominal Jacobian J_n and a constant error E;
+the filter that predicts best has the delay:
 
     x_d = Σ J_n Δq  over the joint motion Δq_d that ended d periods ago
     Δy ≈ M x_d + E Δq_d                          P ← P + diag(w² ‖x_d‖, u² ‖Δq_d‖)
@@ -16,7 +16,7 @@ the motions that the delay pairs then gives the Jacobian.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, TypeAlias, final
+from typing import Final, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from servobench.controllers.periods import in_periods, whole_periods
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.regression import (
     Innovation,
+    IntArray,
     Regression,
     RegressionState,
     fresh_bank,
@@ -49,7 +50,6 @@ REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
 MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
 LAST_THREE = np.array([0, 1, 2])
-IntArray: TypeAlias = npt.NDArray[np.int_]
 
 
 @final
@@ -130,11 +130,13 @@ class Paired(NamedTuple):
         joint_position: (..., n), rad, where the joint motion began.
         joint_step: Δq, (..., n), rad.
         predicted: x = J_n Δq, (..., m).
+        h: its regressors in the regression.
     """
 
     joint_position: FloatArray
     joint_step: FloatArray
     predicted: FloatArray
+    h: FloatArray
 
 
 class Past(NamedTuple):
@@ -253,13 +255,11 @@ class Pairing:
         foreseen = np.matvec(now[..., :-1], pick(h, state.candidate)) - now[..., -1]
         state = self._find_delay(state, h, np.where(valid, feature_step, foreseen), valid)
         begin, passed = pick(begin, state.candidate), pick(passed, state.candidate)
-        paired = Paired(begin[..., :n], passed[..., :n], passed[..., n:])
-        middle = paired.joint_position + 0.5 * paired.joint_step
-        foreseen = self.regression.explained(state.regression, middle, *paired[1:]) - state.regression.mean[..., -1]
-        regression = self.regression.update(
-            state.regression, middle, *paired[1:], np.where(valid, feature_step, foreseen), duration,
-            state.noise.variance,
-        )  # fmt: skip
+        q, step, x = begin[..., :n], passed[..., :n], passed[..., n:]
+        paired = Paired(q, step, x, self.regression.regressors(q + 0.5 * step, step, x))
+        foreseen = self.regression.explained(state.regression, paired.h) - state.regression.mean[..., -1]
+        dy = np.where(valid, feature_step, foreseen)
+        regression = self.regression.update(state.regression, paired.h, dy, duration, state.noise.variance)
         moved = regression.moves > state.regression.moves
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired

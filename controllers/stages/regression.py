@@ -1,17 +1,17 @@
 """A linear regression of the feature's motion on the joints' motion, from which the Jacobian follows everywhere.
 
-The nominal Jacobian J_n is wrong by a matrix M (a camera that is turned or at another distance) and by what the arm
-itself differs in, which is expanded to second order about the centre q_c of the working region:
+The nominal Jacobian J_n is wrong by a matrix M (a camera that is turned or at another distance) and by an error of the
+arm, which is expanded to second order about the centre q_c of the working region:
 
     Δy = M J_n Δq + E Δq + H[r, Δq] + e₊ − e + v              r = q̄ − q_c, q̄ the middle of the motion
     Ĵ(q) = M J_n(q) + E + H[q − q_c, ·]                       H (m, n, n) symmetric in the joints: y is quadratic in q
 
 e, (m,), is the noise of the frame at which the motion began, e₊ ~ N(0, σ² I) that of the new one, and v ~ N(0, c² ‖Δq‖²
-I) what the model leaves. All unknowns are linear in the regressors h, so that a Kalman filter with one covariance P
+I) the rest. All unknowns are linear in the regressors h, so that a Kalman filter with one covariance P
 (K, K) for all rows of W = [E H M e] is exact for a given noise (Bayesian linear regression with a walk of W):
 
     ν = Δy − W h,   s = σ² + (r² T) + c² ‖Δq‖² + hᵀ P h
-    s' = max(s, ‖ν‖²/g),   σ'² = σ² + s' − s                  what exceeds the gate g is taken for noise of this frame
+    s' = max(s, ‖ν‖²/g),   σ'² = σ² + s' − s                  the excess over the gate g counts as noise of this frame
     W ← W + ν (P h)ᵀ/s',   P ← P − (P h)(P h)ᵀ/s'             but for e:
     e ← ν σ'²/s',   P_ee ← σ'² (1 − σ'²/s'),   P_We ← −(P h)_W σ'²/s'
 
@@ -25,7 +25,8 @@ a rotation, to large ones, for which the nominal model is hardly more than one r
 
     ℓ_b ← ℓ_b + min(‖ν‖²/s', cap) + m ln s',   μ_b ∝ exp(−ℓ_b/2),   W̄ = Σ μ_b W_b
 
-After three frames in a row that fit nothing but one another, the camera was moved: P returns to the prior.
+Three successive frames that do not fit the estimate, but agree with each other, show a moved camera: P returns to the
+prior.
 All functions are pure; the axis of the filters follows the leading axes of runs side by side.
 """
 
@@ -49,7 +50,7 @@ NIS_CAP: Final = 30.0  # [1] of ‖ν‖²/s' of one motion in the score of a fi
 LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
-MOVED_FRAMES: Final = 3  # frames in a row that fit nothing but one another, after which the camera was moved
+MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
 AGREEMENT: Final = 0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
 DEVIATIONS: Final = np.array([0.01, 0.1, 0.4])  # [m/rad] prior deviation of an entry of E; per rad of H
 PRIOR: Final = np.array([0.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
@@ -161,7 +162,7 @@ class RegressionState(NamedTuple):
         mean: W̄ with e, (..., m, K).
         share: Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise.
         rotation: R of the filter with the largest weight of those that have one, (..., m, m).
-        streak: frames in a row that fit nothing but one another, (...).
+        streak: number of successive frames that do not fit but agree with each other, (...).
         moves: how often the camera seems to have been moved, (...).
     """
 
@@ -179,7 +180,7 @@ class Regression:
     """Estimates Ĵ(q) and the noise e of the last frame, as above."""
 
     def __init__(self, knowledge: RobotKnowledge) -> None:
-        """Take the sizes, and the working region, about the centre of which is expanded."""
+        """Take the sizes, and the working region, whose centre is q_c."""
         spec = knowledge.spec
         self._m, self._n = m, n = spec.m, spec.n
         self._pairs = np.triu_indices(n)
@@ -215,9 +216,7 @@ class Regression:
     def update(
         self,
         state: RegressionState,
-        middle: FloatArray,
-        joint_step: FloatArray,
-        predicted: FloatArray,
+        h: FloatArray,
         feature_step: FloatArray,
         duration: FloatArray,
         frame: FloatArray,
@@ -226,14 +225,12 @@ class Regression:
 
         Args:
             state: before.
-            middle: q̄, (..., n), rad.
-            joint_step: Δq, (..., n), rad.
-            predicted: J_n Δq, (..., m), m.
+            h: its regressors, (..., K−1).
             feature_step: Δy, (..., m), m.
             duration: T, (...), s.
             frame: σ², (...), m².
         """
-        h = np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+        joint_step = h[..., : self._n]
         square = np.vecdot(joint_step, joint_step)
         moved = square >= MIN_MOTION**2
         walk = (np.sqrt(square) * moved)[..., None, None] * self._walk
@@ -255,11 +252,18 @@ class Regression:
         H = W[..., n : self._map.start] @ self._quadratic(joint_position)
         return np.asarray(W[..., self._map] @ nominal + W[..., :n] + H)
 
-    def explained(
-        self, state: RegressionState, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray
-    ) -> FloatArray:
-        """Return the motion Ĵ Δq, (..., m), of a joint motion; see `update`."""
-        h = np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+    def regressors(self, middle: FloatArray, joint_step: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return h, (..., K−1), of a motion but for the −1 of e.
+
+        Args:
+            middle: q̄, (..., n), rad.
+            joint_step: Δq, (..., n), rad.
+            predicted: J_n Δq, (..., m), m.
+        """
+        return np.concatenate([joint_step, np.matvec(self._quadratic(middle), joint_step), predicted], axis=-1)
+
+    def explained(self, state: RegressionState, h: FloatArray) -> FloatArray:
+        """Return the motion Ĵ Δq, (..., m), of a joint motion with the regressors h."""
         return np.asarray(np.matvec(state.mean[..., :-1], h))
 
     def deviation(self, state: RegressionState) -> FloatArray:
@@ -281,7 +285,7 @@ class Regression:
         return derivative
 
     def _streak(self, state: RegressionState, found: Innovation, last: FloatArray) -> IntArray:
-        """Return how many frames in a row do not fit, of which each agrees with the one before.
+        """Return the number of successive frames that do not fit, each of which agrees with the one before.
 
         Args:
             state: before the motion.

@@ -10,7 +10,7 @@ from typing import Final
 import pandas as pd
 
 from page_studies import cells
-from page_studies.study import BOTH, FIVE, PUBLISHED, SUFFIX, Study, Words, settings, sweep
+from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of
@@ -28,7 +28,6 @@ MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
 WITHOUT = "mfac+constant"  # the regression alone
 LEARNERS = (WITHOUT, "mfac+ukf", "mfac+rbf", "mfac+true")
-CHALLENGED = (*FIVE, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in FIVE))
 FRESH = "139447:139647"  # from the hash of the last commit that changed code before they were drawn
 LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
 
@@ -86,7 +85,7 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
         row = {"challenge": f"`{name}`", "grade": grade, "reference": f"{own['reference'].iloc[0]:.2f} {unit}"}
         for method in FIVE:
             row[cells.quoted(method)] = scored(own.loc[method])
-        best = own.loc[[name for name in CHALLENGED if name.endswith(SUFFIX)]]["score"].idxmax()
+        best = own.loc[[name for name in RENDERED if name.endswith(SUFFIX)]]["score"].idxmax()
         row["best as published"] = f"{cells.quoted(best.removesuffix(SUFFIX))} {scored(own.loc[best])}"
         rows.append(row)
     ranking = pd.read_csv(folder / "runs" / "ranking.csv")
@@ -177,7 +176,7 @@ CHALLENGES = Study(
             "--plants",
             "kinematic",
             "--controllers",
-            ",".join(CHALLENGED),
+            ",".join(RENDERED),
             "--seeds",
             FRESH,
             "--reference-seeds",

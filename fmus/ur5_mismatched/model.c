@@ -10,8 +10,8 @@
 /* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
 #define STOP_HYSTERESIS 1e-9
 /* Over which play is updated once, and the acceleration of a flexible tool changes linearly, at most [s]. */
-#define LONGEST_PART 0.005
-#define MOST_PARTS 1000.0 /* of a step; an importer may ask for one of any length */
+#define MAX_PART 0.005
+#define MAX_PARTS 1000.0 /* of a step; an importer may ask for one of any length */
 
 enum { STALE_FEATURE = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
@@ -317,7 +317,7 @@ static double count_parts(const Model *model, double step)
 {
     int whole = model->values[OFFSET_TOOL_FREQUENCY] == 0.0;
     for (size_t i = 0; i < N_JOINTS; i++) whole &= model->values[OFFSET_BACKLASH + i] == 0.0;
-    return whole ? 1.0 : fmin(fmax(1.0, ceil(step / LONGEST_PART - 1e-9)), MOST_PARTS);
+    return whole ? 1.0 : fmin(fmax(1.0, ceil(step / MAX_PART - 1e-9)), MAX_PARTS);
 }
 
 ModelStatus model_step(Model *model, double step)

@@ -1,12 +1,12 @@
 """Challenges: named worlds that tell methods apart, a TOML file each.
 
-    title, why         what the world is, and a sentence of physics
+    title, why         the world in some words, and a sentence of physics
     task, mismatch     as of a run; period [s], latency [s] and noise (a factor) where they differ from the usual ones
     measure            settling: the settling time of a move; path: the RMS error of the judged part, as of the last lap
     reference          methods that know the true robot; on each robot the better one bounds the others. They run on
                        the first `reference_seeds` robots, or on all
     [settings]         further settings, SECTION.KEY = VALUE, of the sections run, plant and task
-    plants, picture    those on which it is carried out unless a user names others; a file beside it
+    plants             those on which it is carried out unless a user names others
     [grade]            name, date and the mean scores of the methods that gave it, written once
 
 Grade I: all equipped methods pass. II: the best and the worst of them differ by a factor of three or by 30 points of
@@ -51,7 +51,7 @@ FOLDER: Final = files("servobench.harness.studies") / "challenges"
 
 
 class Measure(NamedTuple):
-    """What a challenge judges.
+    """The measure of a challenge.
 
     Attributes:
         column: of the table of runs; less is better.
@@ -100,7 +100,6 @@ class Challenge:
     noise: NonNegative | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     reference_seeds: Count | None = None
-    picture: str = ""
     grade: Grade = nested(Grade)
 
     def cells(
@@ -112,7 +111,7 @@ class Challenge:
             plants: names; none for those of the file.
             controllers: names of methods.
             seeds: of the robots.
-            bounded: number of robots on which the references run; None for what the file says.
+            bounded: number of robots on which the references run; None for that of the file.
         """
         short = {name: getattr(self, name) for name in SHORT_NAMES if getattr(self, name) is not None}
         varied = tuple((short | flatten(self.settings)).items())
@@ -125,7 +124,7 @@ class Challenge:
         ]
 
     def check(self) -> None:
-        """Refuse what cannot be carried out or judged.
+        """Refuse a challenge that cannot be carried out or judged.
 
         Raises:
             ValueError: names it.

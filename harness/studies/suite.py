@@ -41,7 +41,7 @@ from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
 
 MAX_REFERENCE_LOSS: Final = 0.05
-REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see what all methods see
+REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see the images of all methods
 RUNS, METHODS, RANKING, PICTURE = "scores.csv", "methods.csv", "ranking.csv", "suite"
 FACTORS: Final = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
 DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())

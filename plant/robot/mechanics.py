@@ -21,7 +21,7 @@ from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
-LONGEST_PART: Final = 0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
+MAX_PART: Final = 0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
 Motion: TypeAlias = tuple[FloatArray, FloatArray]
 """p [m] and ṗ [m/s], (..., 3) each."""
 
@@ -56,7 +56,7 @@ class MechanicsConfig:
     def parts(self, period: float) -> int:
         """Return in how many parts a period [s] is integrated."""
         off = self.tool_frequency == 0.0 and self.backlash == 0.0
-        return 1 if off else max(1, math.ceil(period / LONGEST_PART - 1e-9))
+        return 1 if off else max(1, math.ceil(period / MAX_PART - 1e-9))
 
     def transmitted(self, q: FloatArray) -> FloatArray:
         """Return g, (..., n) rad."""

@@ -155,7 +155,8 @@ class Walking:
     def move(self, middle, step, x, dy):
         given = (middle, step, x, dy, np.float64(PERIOD))
         self.seen.append(given)
-        self.state = self.stage.update(self.state, *given, self.frame)
+        h = self.stage.regressors(middle, step, x)
+        self.state = self.stage.update(self.state, h, dy, np.float64(PERIOD), self.frame)
         return self
 
     def follow(self, count, feature, nominal, seed=0, shift=None, size=0.03):
@@ -199,7 +200,7 @@ def test_a_feature_that_is_quadratic_in_the_joints_is_explained_exactly():
     for _ in range(5):
         q, step = rng.uniform(LOWER, UPPER), rng.normal(size=N)
         np.testing.assert_allclose(run.jacobian(q, NOMINAL), differences(feature, q), atol=1e-9)
-        explained = run.stage.explained(run.state, q + step / 2, step, NOMINAL @ step)
+        explained = run.stage.explained(run.state, run.stage.regressors(q + step / 2, step, NOMINAL @ step))
         np.testing.assert_allclose(explained, feature(q + step) - feature(q), atol=1e-12)
 
 
@@ -368,8 +369,8 @@ def test_a_lane_has_the_bits_of_a_single_run():
     def run(lanes):
         state = made.start(np.shape(lanes), 1e-6)
         for k in range(40):
-            given = (each[k, lanes] for each in (middles, steps, x, dy))
-            state = made.update(state, *given, np.full(np.shape(lanes), PERIOD)[()], frames[k, lanes])
+            h = made.regressors(*(each[k, lanes] for each in (middles, steps, x)))
+            state = made.update(state, h, dy[k, lanes], np.full(np.shape(lanes), PERIOD)[()], frames[k, lanes])
             if k == 33:
                 state = made.interrupt(state, frames[k, lanes])
         return state

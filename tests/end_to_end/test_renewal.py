@@ -205,9 +205,9 @@ def lay_out_suite(folder):
         "score": 0.5,
         "good.value": 99.0,
     }
-    pd.DataFrame([{**own, "controller": name} for name in worlds.CHALLENGED]).to_csv(folder / "methods.csv")
+    pd.DataFrame([{**own, "controller": name} for name in worlds.RENDERED]).to_csv(folder / "methods.csv")
     rank = {"rank": 1, "score.value": 0.5, "score.low": 0.4, "score.high": 0.6, "lost, %": 1.0, "within 2×": 0.5}
-    pd.DataFrame([{**rank, "controller": name} for name in worlds.CHALLENGED]).to_csv(folder / "ranking.csv")
+    pd.DataFrame([{**rank, "controller": name} for name in worlds.RENDERED]).to_csv(folder / "ranking.csv")
 
 
 @pytest.mark.parametrize("module", [held_out, physical, worlds], ids=lambda module: module.__name__)

@@ -14,7 +14,7 @@ number allows, in an order that the set's seed draws: nobody chooses which meet,
 
 Errors e below the floor of 1.5 mm cost nothing, and above 1 m all the same. The cost is continuous in the error: a run
 that leaves the settling band late costs hardly more than one that does not. Each instant of a move counts alike, so the
-cost of an approach grows in proportion to its settling time. A curve's cost is the logarithm of what it is judged by.
+cost of an approach grows in proportion to its settling time. A curve's cost is the logarithm of its judged error.
 """
 
 from __future__ import annotations
