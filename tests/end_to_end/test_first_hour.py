@@ -30,9 +30,7 @@ HOUR = (
     "own_controller",
     "own_robot",
     "own_sensing",
-    "own_fmu",
-    "controllers_elsewhere",
-    "simulink",
+    "fmu",
     "learning",
 )
 SITE = sorted({*SESSIONS, *HOUR}, key=ORDER.index)
