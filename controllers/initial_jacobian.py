@@ -49,9 +49,11 @@ class InitialJacobian(ABC, Generic[State]):
 
     Attributes:
         immediate: whether Ĵ₀ is known from the start, so that `step` is never called.
+        duration: [periods] until it is known, where no frame is lost.
     """
 
     immediate: ClassVar[bool]
+    duration: int = 0
 
     @abstractmethod
     def start(self, observation: Observation) -> State:
@@ -139,6 +141,8 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         """
         self._config = config
         self._spec = spec
+        rest = config.average_periods
+        self.duration = rest + spec.n * (config.probe_periods + config.settle_periods + rest - 1)
         self._speed = config.probe_step / (config.probe_periods * spec.period)
         slowest = float(spec.joint_velocity_limit.min())
         if self._speed > slowest:

@@ -82,6 +82,12 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     return moves, curves
 
 
+def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by their names
+    """Return a table whose columns are pairs (group, heading)."""
+    table = pd.DataFrame(rows)
+    return table if table.empty else table.set_axis(pd.MultiIndex.from_tuples(table.columns), axis=1)
+
+
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
     """Return a column of the table of runs, NaN throughout where the table has none of this name."""
     return runs.reindex(columns=[name])[name]

@@ -23,6 +23,7 @@ from servobench.harness.analysis.comparison import (
     achievement,
     column_of,
     compare_pairs,
+    grouped,
     in_handy_units,
     margin,
     metric_heading,
@@ -321,7 +322,7 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
                 f"{median_with_interval(table[name]):.{digits}f}" if name in table and len(table) else MISSING
             )
         rows.append(row)
-    return pd.DataFrame(rows)
+    return grouped(rows)
 
 
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
@@ -349,7 +350,7 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
             share = success_rate(count, len(own)).scaled(100.0)
             row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if count else MISSING
         table.append(row)
-    return pd.DataFrame(table)
+    return grouped(table)
 
 
 def meanings(table: pd.DataFrame) -> dict[str, str]:
@@ -374,7 +375,7 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
         example = {"run": first["run_id"], "reason": first.get("reason") or MISSING}
         rows.append({(WHICH, name): str(text) for name, text in which.items()}
                     | {("The first of them", name): str(text) for name, text in example.items()})  # fmt: skip
-    return pd.DataFrame(rows)
+    return grouped(rows)
 
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -393,7 +394,7 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
         _, factor = shown_unit(name, runs)
         spec = f".{METRICS[name].digits}f"
         table[group, metric_heading(name, runs)] = [number(factor * value, spec) for value in column_of(runs, name)]
-    return pd.DataFrame(table)
+    return grouped(table)
 
 
 def ordered(names: pd.Series[str]) -> list[str]:
@@ -420,7 +421,7 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
             middle = _median_of(own, name, shown_unit(name, runs)[1])
             row[group, metric_heading(name, runs)] = f"{middle:.{METRICS[name].digits}f}"
         rows.append(row)
-    return pd.DataFrame(rows)
+    return grouped(rows)
 
 
 def _rows(runs: pd.DataFrame, keys: Sequence[str]) -> Iterator[tuple[PageRow, pd.DataFrame]]:

@@ -18,6 +18,7 @@ import pandas as pd
 from servobench.harness.analysis.comparison import (
     achieved_share,
     column_of,
+    grouped,
     knows_truth,
     margin,
     outcomes,
@@ -91,7 +92,7 @@ def leaders(runs: pd.DataFrame, names: Sequence[str] | None = None) -> pd.DataFr
         for words, place in split_conditions(runs)
         if (own := place[place["controller"].isin(names)])["controller"].nunique() > 1
     ]
-    return pd.DataFrame([_leader(*each) for each in competitions] if len(competitions) <= MOST_PLACES else [])
+    return grouped([_leader(*each) for each in competitions] if len(competitions) <= MOST_PLACES else [])
 
 
 def judged_metric(place: pd.DataFrame) -> str:

@@ -76,7 +76,10 @@ def record(
         float | None, option("SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001)
     ] = None,
     out: Annotated[
-        Path | None, option("FOLDER", "Folder for the films; default: recordings in the results folder.")
+        Path | None,
+        option(
+            "PATH", "Folder for the films, or the file of one film (.mp4, .gif); default: recordings in the folder."
+        ),
     ] = None,
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.
@@ -85,16 +88,19 @@ def record(
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import engine_of, rendered_plant
-    from servobench.harness.pictures.film import KINDS, find_kind, write_recording
+    from servobench.harness.pictures.film import GIF, KINDS, MP4, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
-    wanted = selection.split_names("kinds", kinds, KINDS, find_kind)
-    into = out or (folder or Path("results")) / RECORDINGS
+    film = out if out is not None and out.suffix.removeprefix(".") in (MP4, GIF) else None
+    if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
+        raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
+    wanted = selection.split_names("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS, find_kind)
+    into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
         shown = _shown(folder, run, new)
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
-        stem = into / str(shown.track.row["run_id"])
+        stem = into / str(shown.track.row["run_id"]) if film is None else film.with_suffix("")
         paths = write_recording(stretch(shown, begin, length), stem, wanted, tell)
     for path in paths:
         say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

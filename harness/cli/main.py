@@ -108,7 +108,7 @@ def main() -> None:
             raise
         sys.stderr.write(f"servobench: {line}{_resuming()}\n")
         code = FAILED
-    if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
+    if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that keep something say so by themselves
         sys.stderr.write("servobench: interrupted\n")
     sys.exit(code)
 

@@ -26,7 +26,7 @@ from rich.text import Text
 
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, Observer, Row
-from servobench.harness.cli.terminal import INTERRUPTED
+from servobench.harness.cli.terminal import end_interrupted
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
 
@@ -178,8 +178,7 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
         if not any(folder.rglob("*.parquet")):
             raise
         done = max(observer.done, sum(map(len, results.finished_runs(folder))))  # a last one may be untold
-        kept = f"{done} of {observer.total} runs were finished and kept in {folder}"
-        sys.stderr.write(f"servobench: interrupted: {kept}; the same call with --resume and this --out continues\n")
-        raise SystemExit(INTERRUPTED) from None
+        kept = f"{done} of {observer.total} runs are finished and kept in {folder}"
+        end_interrupted(kept, "the same call with --resume and this --out continues")
     finally:
         observer.close()

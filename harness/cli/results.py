@@ -159,6 +159,6 @@ def judge(folder: Path, tables: Iterable[pd.DataFrame], *, strict: bool) -> None
     count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
     if not failed:
         return
-    say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why, with traces: {folder / results.FAILURES}")
+    say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}")
     if strict:
         sys.exit(FAILED)

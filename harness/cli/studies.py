@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_rows, print_tables, say
+from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
@@ -231,6 +231,7 @@ def tune(
         if check:
             _check(out, names, runs.second(), opened)
             return
+        say(f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less")
         methods = open_methods(out, plan)
         interrupted = not _advance(methods, plan, opened)
     results = write_results(out, methods)
@@ -238,12 +239,19 @@ def tune(
         _print_tuned(results)
         say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:
-        _say_interrupted()
+        _end_interrupted(out)
 
 
-def _say_interrupted() -> None:
-    say("interrupted; the same call continues where it stopped")
-    sys.exit(INTERRUPTED)
+def _counted(plan: TuningPlan) -> str:
+    """Return how many points and runs a campaign has, without those of its second set of robots."""
+    methods, budget, runs = len(plan.controllers), plan.trials + plan.search, len(plan.runs.runs())
+    points = methods * plan.studies * budget
+    words = f"{methods} method{'s' * (methods > 1)} × {plan.studies} studies × {budget} points"
+    return f"{words} × {runs} runs = {points * runs} runs"
+
+
+def _end_interrupted(out: Path) -> NoReturn:
+    end_interrupted(f"finished points are kept in {out}", "the same call continues")
 
 
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
@@ -259,7 +267,7 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
             for done, _ in enumerate(checked.carry_out(workers), begun + 1):
                 bars.reach(bar, done, f"{done} of {total} points")
     except KeyboardInterrupt:
-        _say_interrupted()
+        _end_interrupted(folder)
     found = improvements(checked.changes())
     if not found:
         say(f"no change improves a score by more than {TOLERANCE:.0%}")

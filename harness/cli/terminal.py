@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -30,7 +31,21 @@ WHOLE = ("controller", "pair")  # columns whose cells are not broken over lines
 CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
 GAP = 2  # [characters] that a table needs for each column beside its cells
 
-console = Console()
+
+class Terminal(Console):
+    """A console on which `pixel:hand:` is no emoji, and whose command goes on if nobody reads its output any more."""
+
+    def __init__(self) -> None:
+        """Print to standard output."""
+        super().__init__(emoji=False)
+
+    def on_broken_pipe(self) -> None:
+        """Print no more; figures and reports are made all the same."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+console = Terminal()
 
 
 @contextlib.contextmanager
@@ -118,6 +133,12 @@ def _shares(names: list[str], least: dict[str, int], whole: dict[str, int], room
             break
         widths = {name: max(least[name], min(whole[name], most)) for name in names}
     return widths
+
+
+def end_interrupted(kept: str, going_on: str) -> NoReturn:
+    """End the command after Ctrl-C with a line that says what is kept and which call goes on."""
+    sys.stderr.write(f"servobench: interrupted: {kept}; {going_on}\n")
+    raise SystemExit(INTERRUPTED)
 
 
 def say(line: str) -> None:

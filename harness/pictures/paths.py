@@ -1,4 +1,4 @@
-"""Paths of the feature in space, in two views to scale: along the optical axis of the camera, and from above."""
+"""Paths of the feature in space, in two views to scale: along the optical axis of the camera, and from the side."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
 ROOM: Final = 1.16  # of a view over the paths in it
 ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
 # Labels of a feature in the frame of the camera.
-CAMERA_FRAME: Final = {"x_m": "x, to the right [m]", "y_m": "y, downwards [m]", "z_m": "z, depth [m]"}
+CAMERA_FRAME: Final = {"x_m": "x, to the right [m]", "y_m": "y, downwards [m]", "z_m": "z, depth downwards [m]"}
 PIXELS: Final = "px"  # unit of a feature in an image, where the second one of a pair points down
 
 
@@ -93,7 +93,7 @@ def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[Block]:
 def _views(tracks: Tracks) -> list[View]:
     features = longest(tracks).features
     if features[:3] == list(CAMERA_FRAME):
-        return [View("camera's view", 0, 1), View("from above", 0, 2)]
+        return [View("camera's view", 0, 1), View("from the side", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
     if features[0].endswith(f"_{PIXELS}") and len(names) % 2 == 0:
         return [View(f"{names[i + 1]} over {names[i]}", i, i + 1) for i in range(0, min(4, len(names)), 2)]
@@ -129,7 +129,7 @@ class _Extent:
         axes.set(xlim=(x - half, x + half), ylim=(y - high, y + high))
         if to_scale:
             axes.set_aspect("equal", adjustable="box")
-        if axes.get_ylabel() == CAMERA_FRAME["y_m"] or self._units[0] == PIXELS:
+        if axes.get_ylabel() in CAMERA_FRAME.values() or self._units[0] == PIXELS:
             axes.invert_yaxis()
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
         axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))

@@ -288,7 +288,7 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
         axes.set_title(title)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
-    if not longest(tracks).long:
+    if until > 0.0 and not longest(tracks).long:  # a run may end in its first period
         panels[0, 0].set_xlim(-0.02 * until, until)
     figure.align_ylabels(panels[:, 0])
     add_legend(figure, panels[0])

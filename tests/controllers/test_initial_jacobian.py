@@ -54,10 +54,11 @@ def test_probing_through_default_noise_is_as_good_as_the_averaged_noise_allows()
 
 
 def test_probing_takes_the_periods_that_its_settings_tell():
-    config = InitialConfig(source="probe")
-    _, periods = probe(kinematic())
+    plant, config = kinematic(), InitialConfig(source="probe")
+    _, periods = probe(plant)
     each = config.probe_periods + config.settle_periods + config.average_periods
     assert periods == config.average_periods - 1 + 6 * each - 6
+    assert initial_jacobian(config, RobotKnowledge(plant.spec, 0)).duration == periods + 1
 
 
 def test_lost_frames_prolong_probing_and_do_no_harm():

@@ -232,6 +232,16 @@ def test_a_new_run_is_recorded_below_the_results_without_ffmpeg(monkeypatch, cap
     assert f"{name}.png" in capsys.readouterr().out
 
 
+def test_a_file_named_as_a_film_is_that_film(monkeypatch, capsys, tmp_path, folder):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
+    target = tmp_path / "mine.gif"
+    assert servobench(monkeypatch, "record", str(folder), "--out", str(target), "--length", "0.2") == 0
+    assert target.read_bytes().startswith(b"GIF8")
+    assert list(tmp_path.iterdir()) == [target]
+    assert servobench(monkeypatch, "record", str(folder), "--out", str(target), "--kinds", "mp4") == 2
+    assert "names one film; leave --kinds mp4 away" in capsys.readouterr().err
+
+
 def test_a_folder_with_several_runs_wants_a_name(monkeypatch, capsys, tmp_path, result):
     results.create_folder(tmp_path / "out", {})
     for index, name in enumerate(("a", "b")):

@@ -63,6 +63,6 @@ def test_ctrl_c_keeps_the_study(tmp_path):
     code, output = finish(process)
     assert code == 130, output
     assert "Traceback" not in output
-    assert "interrupted; the same call continues where it stopped" in output
+    assert f"servobench: interrupted: finished points are kept in {out}; the same call continues" in output
     assert [path.name for path in out.iterdir()] == ["constant.jsonl"]
     assert ledger.read_text().count('"costs"') >= 2

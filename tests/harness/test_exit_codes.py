@@ -81,13 +81,13 @@ def test_exit_codes(call, arguments, code):
     assert call(*arguments) == code
 
 
-def test_a_run_that_failed_is_told_with_its_place_and_where_the_trace_is(call, capsys):
+def test_a_run_that_failed_is_told_with_its_place_and_the_log(call, capsys):
     call(*RUN, "crashing")
     lines = capsys.readouterr().out.splitlines()
     reason = next(line for line in lines if line.startswith("kinematic-crashing-exp2-moderate-0: "))
     assert reason.startswith("kinematic-crashing-exp2-moderate-0: crashed: KeyError: 'gain' (test_exit_codes.py:")
     assert reason.endswith(" in Ending.step)")
-    assert lines[-1] == f"1 of 1 run failed; why, with traces: out/{results.FAILURES}"
+    assert lines[-1] == f"1 of 1 run failed; why: out/{results.FAILURES}"
 
 
 @pytest.mark.parametrize("command", [RUN, COMPARE, SWEEP])

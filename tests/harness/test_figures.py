@@ -134,14 +134,14 @@ def test_along_a_curve_the_error_is_a_root_mean_square_over_half_a_second(tmp_pa
 
 def test_paths_are_drawn_to_scale_in_two_views_that_share_the_abscissa():
     tracks = {"ukf_mfac": Track(made_up_row("a"), made_up_steps("a"))}
-    front, above = draw_paths({"exp1": tracks}, STYLES).axes
-    assert (front.get_title(), above.get_title()) == ("exp1: camera's view", "exp1: from above")
-    assert front.get_aspect() == above.get_aspect() == 1.0
-    assert front.get_xlim() == above.get_xlim()
+    front, side = draw_paths({"exp1": tracks}, STYLES).axes
+    assert (front.get_title(), side.get_title()) == ("exp1: camera's view", "exp1: from the side")
+    assert front.get_aspect() == side.get_aspect() == 1.0
+    assert front.get_xlim() == side.get_xlim()
     assert front.yaxis_inverted()
-    assert not above.yaxis_inverted()
-    assert [axes.get_ylabel() for axes in (front, above)] == ["y, downwards [m]", "z, depth [m]"]
-    for axes, row in ((front, 1), (above, 2)):
+    assert side.yaxis_inverted()  # the camera hangs above and looks down
+    assert [axes.get_ylabel() for axes in (front, side)] == ["y, downwards [m]", "z, depth downwards [m]"]
+    for axes, row in ((front, 1), (side, 2)):
         (start,), (target,) = lines_of(axes, "start"), lines_of(axes, "target")
         assert (start.get_xdata()[0], start.get_ydata()[0]) == pytest.approx((0.3, 0.1 * row + 0.3))
         assert (target.get_xdata()[0], target.get_ydata()[0]) == pytest.approx((0.0, 0.1 * row))

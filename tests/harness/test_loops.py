@@ -191,6 +191,12 @@ def test_a_law_that_was_trained_on_the_nominal_model_has_a_delay_margin():
     assert np.abs(linear.D).max() > 0.0
 
 
+def test_a_controller_is_warm_after_its_probing_however_long_that_takes():
+    warm = warm_up(resolved("ukf_mfac", initial={"source": "probe", "average_periods": 20}))
+    assert warm.controller.state.ready
+    linear_controller(warm, "true")
+
+
 def test_only_a_composed_controller_has_a_fast_delay_margin():
     with pytest.raises(TypeError, match="controller must be a ServoController"):
         delay_margin(resolved("nmpc_calibrated").controller, "nmpc_calibrated")

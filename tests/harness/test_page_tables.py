@@ -9,6 +9,7 @@ import pytest
 from kit.folders import comparison, failed_only, made_up_row, sweep
 from servobench.harness.analysis import tables
 from servobench.harness.analysis.folder import describe_folder, describe_settings
+from servobench.harness.analysis.verdict import leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES
 from servobench.harness.run.metrics import METRICS
@@ -51,6 +52,14 @@ def test_no_table_holds_the_largest_error_of_a_move_which_is_its_start(tmp_path)
     runs = results.load_runs(comparison(tmp_path / "out"))
     every = [*tables.move_tables(runs).values(), *tables.curve_tables(runs).values(), tables.overview(runs)]
     assert not [name for table in every for name in table.columns if "largest error" in name[1]]
+
+
+def test_the_headings_of_a_notebook_are_two_rows_and_no_tuples(tmp_path):
+    runs = results.load_runs(comparison(tmp_path / "out"))
+    every = tables.overview, tables.cost_table, tables.runs_table, tables.outcome_table, tables.failure_table, leaders
+    for table in (make(runs) for make in every):
+        assert table.empty or table.columns.nlevels == 2
+        assert "(" not in table.iloc[:0].to_html(index=False)
 
 
 def test_a_published_method_stands_below_its_method_and_others_keep_their_order():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -113,6 +115,27 @@ def test_the_command_prints_the_tables_of_a_folder(runs, tmp_path, monkeypatch, 
     folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
     assert servobench(monkeypatch, "statistics", str(folder), *option) == 0
     assert word in capsys.readouterr().out
+
+
+def test_the_name_of_a_sensing_set_up_is_no_emoji(capsys):
+    terminal.print_tables([("random on kinematic pixel:hand: settled", pd.DataFrame({"a": ["pixel:hand:"]}))])
+    printed = capsys.readouterr().out
+    assert printed.count("pixel:hand:") == 2
+
+
+def test_a_command_whose_output_nobody_reads_any_more_does_its_work_silently():
+    code = """
+import os
+from servobench.harness.cli.terminal import say
+read, write = os.pipe()
+os.dup2(write, 1)
+os.close(read)
+say("lost")
+say("lost")
+os.write(2, b"drawn")
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "drawn")
 
 
 @pytest.mark.parametrize("room", [60, 80, 100, 200])

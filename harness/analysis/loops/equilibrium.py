@@ -41,7 +41,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]
 SOURCES: tuple[Source, ...] = ("true", "nominal", "estimated")
-WARM_UP = 3.0  # [s] of a move, in which aids identify delay, response and noise
+WARM_UP = 3.0  # [s] of a move after any probing, in which aids identify delay, response and noise
 SETTLING_PERIODS = 40  # of rest, after which histories and filters hold the rest only
 PLANT = "kinematic"
 TASK = "random"
@@ -277,7 +277,8 @@ def warm_up(resolved: ResolvedRun) -> Warm:
     """
     experiment, seed = build(resolved), resolved.request.seed
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    length = LoopSettings(run.periods(WARM_UP), run.preview_rows)
+    probing = controller.servo.initial.duration if isinstance(controller, ServoController) else 0
+    length = LoopSettings(probing + run.periods(WARM_UP), run.preview_rows)
     rollout = begin(plant, controller, experiment.desired(length.periods), length, (seed, seed))
     for _ in periods(rollout, controller):
         pass
