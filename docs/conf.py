@@ -47,6 +47,8 @@ html_title = "servobench"
 html_show_sourcelink = False
 copybutton_exclude = ".linenos, .gp, .go"
 
+ACCENT = re.compile(r"(\\(?:bar|dot|hat|tilde)\{[^{}]*\})_")  # docutils would set the index below the accented letter
+FENCE = re.compile("<mo[^>]*>([‖⟨⟩|])</mo>")  # which a browser would stretch to the height of the row
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+\.md)(?:#[^)\s]*)?\)")  # files beside the code
 
 
@@ -62,7 +64,8 @@ def setup(app: Sphinx) -> None:
 def write_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
     """Write an equation as MathML."""
     block = isinstance(node, nodes.math_block)
-    mathml = latex2mathml.tex2mathml(node.astext(), as_block=block)
+    mathml = latex2mathml.tex2mathml(ACCENT.sub(r"\1{}_", node.astext()), as_block=block)
+    mathml = FENCE.sub(r'<mo stretchy="false">\1</mo>', mathml)
     writer.body.append(f'<div class="formula">{mathml}</div>' if block else mathml)
     raise nodes.SkipNode
 
