@@ -25,6 +25,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.run.request import SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.units import split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 MAX_SEEDS: Final = 1_000_000  # of a batch
@@ -294,13 +295,17 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
         ValueError: the range is malformed or empty.
     """
     values: Sequence[Any]
-    if re.fullmatch(r"[-+0-9.e]+(:[-+0-9.e]+){2}", text):
-        values = parse_range(name, text)
+    span = re.fullmatch(r"([-+0-9.e]+(?::[-+0-9.e]+){2})\s*([a-zA-Zµ°%/²]*)", text)
+    if span is not None:
+        values = parse_range(name, span[1])
+        values = [f"{each:g}{span[2]}" for each in values] if span[2] else values
     else:
         try:
             values = tomllib.loads(f"values = [{text}]")["values"]
         except (ValueError, RecursionError):
-            values = [part.strip() for part in text.split(",")]  # bare words
+            words = [part.strip() for part in text.split(",")]
+            parts = [split_quantity(word) for word in words]
+            values = [part[0] if part and not part[1] else word for part, word in zip(parts, words, strict=True)]
     numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
     if numeric and any(isinstance(each, float) for each in values):
         values = [float(each) for each in values]

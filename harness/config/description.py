@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
 import json
 import math
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the begin of a string below a field
+from servobench.plant.contract.settings import UNIT, field_strings
+
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
@@ -52,7 +50,8 @@ class Setting:
 
 def describe_settings(config: Any, prefix: str = "") -> Iterator[Setting]:  # noqa: ANN401 - any settings
     """Yield each setting of a configuration dataclass, those of nested sections with their name before theirs."""
-    strings, hints = field_strings(type(config)), get_type_hints(type(config), include_extras=True)
+    kind: Any = type(config)
+    strings, hints = field_strings(kind), get_type_hints(kind, include_extras=True)
     for item in fields(config):
         value = getattr(config, item.name)
         if is_dataclass(value):
@@ -60,27 +59,6 @@ def describe_settings(config: Any, prefix: str = "") -> Iterator[Setting]:  # no
         else:
             unit, meaning = UNIT.fullmatch(strings.get(item.name, "")).groups(default="")  # type: ignore[union-attr]
             yield Setting(prefix + item.name, value, unit, allowed(hints[item.name]), meaning)
-
-
-def field_strings(kind: type[Any]) -> dict[str, str]:
-    """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
-    strings = {}
-    for each in reversed(kind.__mro__[:-1]):
-        try:
-            source = inspect.getsource(each)
-        except (OSError, TypeError):  # the class was typed in, or is not written in Python
-            continue
-        definition = ast.parse(textwrap.dedent(source)).body[0]
-        for field, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(below, ast.Expr)
-                and isinstance(below.value, ast.Constant)
-                and isinstance(below.value.value, str)
-            ):
-                strings[field.target.id] = " ".join(below.value.value.split())
-    return strings
 
 
 def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation

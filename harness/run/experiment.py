@@ -29,6 +29,7 @@ from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
@@ -36,6 +37,7 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import likely_meant, remark
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, TrueJacobian, hand_eye_spec
@@ -112,6 +114,7 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
     except ValueError as error:
         raise ConfigurationError(f"task {name}: {error}") from error
     _check_times(resolved, scenario.duration)
+    _check_extents(resolved, setting.nominal)
     return scenario
 
 
@@ -361,19 +364,47 @@ def _build_controller(
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
     """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
-    times = {f"{plant}.command_delay": getattr(resolved.plant, "command_delay", 0.0)}
+    times = {"run.period": resolved.run.period}
+    times |= {f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")}
     if isinstance(sensing, SensingConfig):
-        times[f"{plant}.sensing.latency"] = sensing.latency
-        times[f"{plant}.sensing.jitter"] = sensing.jitter
-        times[f"{plant}.sensing.frame_period"] = sensing.frame_period
+        names = ("latency", "jitter", "frame_period", "latency_swing")
+        times |= {f"{plant}.sensing.{name}": getattr(sensing, name) for name in names}
     for name, time in times.items():
         if isinstance(time, float) and time > 0.0 and time >= duration:
-            raise ConfigurationError(f"{name} must be shorter than the run of {duration:g} s, got {time:g} s")
+            meant = likely_meant(time, "s", lambda other: other < duration)
+            raise ConfigurationError(f"{name} must be shorter than the run of {duration:g} s, got {time:g} s{meant}")
     preview = resolved.run.preview_time
     if preview > max(duration, RunSettings().preview_time):
         raise ConfigurationError(
             f"run.preview_time must be no longer than the run of {duration:g} s, got {preview:g} s"
         )
+
+
+def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
+    """Refuse noise, steps and outliers beyond an image, or a metre, and remark on those beyond a tenth of it.
+
+    A plain number of a pixel's noise is one of metres and likely a mistake beyond a tenth.
+    """
+    sensing = getattr(resolved.plant, "sensing", None)
+    if nominal is None or not isinstance(sensing, SensingConfig):
+        return
+    unit, scale = nominal.channel.unit, nominal.noise_unit
+    whole = nominal.optics.size[0] if isinstance(nominal, SetupModel) and unit == "px" else 1.0
+    try:
+        extents = sensing.extents(unit, scale)
+    except ValueError as error:
+        raise ConfigurationError(f"{resolved.request.plant}.{error}") from error
+    for name, metres in extents._asdict().items():
+        given, size, place = getattr(sensing, name), scale * metres, f"{resolved.request.plant}.sensing.{name}"
+        if unit not in ("px", "m") or size <= (1.0 if name == "outlier_size" else 0.1) * whole:
+            continue
+        plain = given == metres
+        words = f"{place} is {size:.4g} {unit}, above a tenth of {whole:g} {unit}"
+        if plain and unit == "px":
+            raise ConfigurationError(f"{words}: a plain number is in metres; for pixels write {given:g}px")
+        if size > whole:
+            raise ConfigurationError(words + likely_meant(metres, "m", lambda other: other <= 0.1 * whole) * plain)
+        remark(words)
 
 
 def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:

@@ -9,12 +9,15 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, SupportsIndex, TypeAlias
+from typing import Annotated, Any, Final, NamedTuple, SupportsIndex, TypeAlias
+
+from annotated_types import Ge
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, settings
+from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, settings
+from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Mismatch
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
@@ -58,7 +61,7 @@ Varied: TypeAlias = tuple[tuple[str, Value], ...]
 class RunSettings:
     """The section `run`: settings that all plants, controllers and tasks share."""
 
-    period: Positive = 0.05
+    period: Annotated[Number, Ge(1e-4), Usual(1.0)] = 0.05
     """[s] control period"""
     preview_time: NonNegative = 0.5
     """[s] of the future reference that every controller gets, rounded up to control periods"""
@@ -125,7 +128,13 @@ class RunRequest:
         if len(by_role) < len(varied):
             raise ConfigurationError(f"a setting is varied twice in {', '.join(varied)}")
         for short in SHORT_NAMES.values():  # their columns hold numbers
-            if isinstance(value := by_role.get(short.key), int):
+            value = by_role.get(short.key)
+            if isinstance(value, str) and (parts := split_quantity(value)):
+                try:
+                    value = in_own_unit(*parts, "s" if short.unit else "1")
+                except ValueError as error:
+                    raise ConfigurationError(f"{short.key} must be {error}, got {value!r}") from error
+            if isinstance(value, int | float):
                 by_role[short.key] = float(value)
         return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))
 

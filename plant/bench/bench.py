@@ -92,11 +92,12 @@ class Bench(Plant):
 
         Raises:
             ValueError: the control period, the delay, the latency or the frame period is no multiple of the world's
-                period, or a camera that is to turn cannot be moved.
+                period, a camera that is to turn cannot be moved, or noise is in pixels and the features are not.
         """
         self.world = world
         self._sensing, self._command_delay = sensing, command_delay
         spec = world.spec
+        self._extents = sensing.extents(spec.feature.unit, world.noise_unit)
         self._period = spec.period if period is None else period
         self._step = spec.period
         self._timing = Timing.of(self._period, spec.period, command_delay, sensing)
@@ -131,7 +132,7 @@ class Bench(Plant):
         if np.shape(seed) != self.world.lead:
             raise ValueError(f"seed must have shape {self.world.lead}, got {np.shape(seed)}")
         interval = self._timing.frames * self._step
-        self._sensor = Sensor(self._sensing, self.spec.m, interval, seed, self.world.lead)
+        self._sensor = Sensor(self._sensing, self._extents, self.spec.m, interval, seed, self.world.lead)
         joints = self.world.reset(seed)
         first = self._expose()
         if first is None:

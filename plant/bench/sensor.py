@@ -28,7 +28,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
-from servobench.plant.contract.sensing import SensingConfig, draw_directions, family_of, quantise
+from servobench.plant.contract.sensing import Extents, SensingConfig, draw_directions, family_of, quantise
 from servobench.plant.contract.signals import BoolArray
 
 TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a window that begins with it
@@ -41,11 +41,14 @@ class Sensor:
         jitters: whether frames are late by different times.
     """
 
-    def __init__(self, config: SensingConfig, m: int, interval: float, seed: Seeds, lead: tuple[int, ...]) -> None:
+    def __init__(
+        self, config: SensingConfig, extents: Extents, m: int, interval: float, seed: Seeds, lead: tuple[int, ...]
+    ) -> None:
         """Begin all streams.
 
         Args:
             config: the settings.
+            extents: the lengths among them, in multiples of the world's unit of noise.
             m: number of features.
             interval: between two frames, s.
             seed: one, or one for each of the runs side by side.
@@ -54,14 +57,15 @@ class Sensor:
         Raises:
             ValueError: a negative seed.
         """
+        self._quantum = extents.quantum
         self._config, self.jitters = config, config.jitter > 0.0 or config.latency_swing > 0.0
-        self._scale = config.noise_factor * config.feature_noise
+        self._scale = config.noise_factor * extents.feature_noise
         stream: Callable[..., Stream] = partial(Stream, seed)
-        self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
+        self._noise = stream("feature_noise", family_of(config, extents), (m,), self._scale)
         share = np.random.Generator.random
         self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
         self._outlier_begins, self._occlusion_begins = stream("outliers", share), stream("occlusions", share)
-        self._outlier_values = stream("outlier_values", draw_directions, (m,), config.outlier_size)
+        self._outlier_values = stream("outlier_values", draw_directions, (m,), extents.outlier_size)
         frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
         self._frames = frames[0], frames[1]
         self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
@@ -77,7 +81,7 @@ class Sensor:
             begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)
             self._outlier = self._outlier.next(begins, frames, self._outlier_values.next())
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
-        return quantise(feature, config.quantum) if config.quantum > 0.0 else feature
+        return quantise(feature, self._quantum) if self._quantum > 0.0 else feature
 
     def missing(self, time: float) -> BoolArray | None:
         """Return in which lanes the frame exposed at `time` [s] arrives without the feature, (...); None for none."""

@@ -38,9 +38,8 @@ class Sensing:
         if mount not in (FIXED, HAND):
             name, mount = word.strip(), FIXED
         if name not in setups:
-            known = suggest(name.partition(":")[0], setups)
             raise ValueError(
-                f"unknown sensing {word!r}: {known}; each also with the camera on the hand, as pixel:{HAND}"
+                f"unknown sensing {word!r}: {suggest(word, [*setups, *(f'{key}:{HAND}' for key in setups)])}"
             )
         return cls(setups[name], HAND if mount == HAND else FIXED)
 

@@ -25,7 +25,17 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.settings import NonNegative, Number, Positive, Share, ShareBelowOne, settings
+from servobench.plant.contract.settings import (
+    Extent,
+    NonNegative,
+    Number,
+    Positive,
+    Share,
+    ShareBelowOne,
+    Usual,
+    check_field,
+    settings,
+)
 
 Family: TypeAlias = Literal["white", "mixture", "bimodal", "stable", "uniform"]
 """A family of noise."""
@@ -39,8 +49,9 @@ Skewness: TypeAlias = Annotated[float, Ge(-1.0), Le(1.0)]
 class SensingConfig:
     """Settings of the path from the true feature to the observation."""
 
-    feature_noise: NonNegative = 0.001
-    """[m] standard deviation σ of the noise of each component; of pixels, its size in the planned image."""
+    feature_noise: Extent = 0.001
+    """[m or px] standard deviation σ of the noise of each component, such as 1mm or 2px; of pixels in metres, their
+    size in the planned image."""
     latency: NonNegative = 0.0
     """[s] between exposure and delivery of a frame; a multiple of the control period, or whole milliseconds."""
     drop_probability: ShareBelowOne = 0.0
@@ -55,20 +66,20 @@ class SensingConfig:
     """Family of the noise of each component."""
     noise_share: Share = 0.1
     """[1] ρ, share of the noise that is displaced, for "mixture" and "bimodal"."""
-    noise_offset: NonNegative = 0.02
-    """[unit of the feature] μ, by how much it is displaced."""
+    noise_offset: Extent = 0.02
+    """[m or px] μ, by how much it is displaced."""
     noise_spread: Positive = 1.0
     """[1] κ, deviation of the displaced part of "mixture" over σ."""
     stability: Stability = 1.5
     """[1] α, exponent of the family "stable": 2 is white, 1 is Cauchy."""
     skewness: Skewness = 0.0
     """[1] β, skewness of the family "stable"."""
-    quantum: NonNegative = 0.0
-    """[unit of the feature] the feature is rounded to multiples of it; 0: it is not."""
+    quantum: Extent = 0.0
+    """[m or px] the feature is rounded to multiples of it; 0: it is not."""
     outliers: ShareBelowOne = 0.0
     """[1] share of the frames that are outliers: the feature is seen elsewhere."""
-    outlier_size: Positive = 0.05
-    """[unit of the feature] distance of an outlier, in a direction drawn at random."""
+    outlier_size: Extent = 0.05
+    """[m or px] distance of an outlier, in a direction drawn at random."""
     outlier_duration: NonNegative = 0.0
     """[s] how long an outlier stays where it is; 0: one frame."""
     occlusions: ShareBelowOne = 0.0
@@ -81,7 +92,7 @@ class SensingConfig:
     """[s] A: a frame exposed at t is late by A (1 + sin(2π t/P)) in addition to the latency."""
     swing_period: Positive = 4.0
     """[s] P of this swing."""
-    camera_turn: NonNegative = 0.0
+    camera_turn: Annotated[NonNegative, Usual(3.2)] = 0.0
     """[rad/s] the first camera turns about its optical axis, from its pose at the start on."""
 
     def __post_init__(self) -> None:
@@ -92,6 +103,44 @@ class SensingConfig:
                     "occlusion_windows must be pairs of a begin above 0, as the run begins with a valid feature, and a "
                     f"later end, in s; got [{begin:g}, {end:g}]"
                 )
+        if self.outlier_size == 0.0:
+            raise ValueError("outlier_size must be above 0, got 0; without outliers, leave outliers at 0")
+
+    def extents(self, unit: str = "m", scale: float = 1.0) -> Extents:
+        """Return the lengths among the settings in multiples of a unit of noise.
+
+        Args:
+            unit: of the features.
+            scale: a metre of noise in this unit.
+
+        Raises:
+            ValueError: one of them is in pixels, and the features are not.
+        """
+        sizes = []
+        for name in Extents._fields:
+            size = getattr(self, name)
+            if isinstance(size, str):
+                if unit != "px":
+                    raise ValueError(f"sensing.{name} is {size}, but the features are in {unit}; write it in {unit}")
+                size = float(size.removesuffix("px")) / scale
+            sizes.append(size)
+        return Extents(*sizes)
+
+
+class Extents(NamedTuple):
+    """Lengths among the settings of a sensor, in metres of a ball that moves across the planned camera.
+
+    Attributes:
+        feature_noise: σ.
+        noise_offset: μ.
+        quantum: to which features are rounded.
+        outlier_size: distance of an outlier.
+    """
+
+    feature_noise: float
+    noise_offset: float
+    quantum: float
+    outlier_size: float
 
 
 def without_disturbance(sensing: SensingConfig) -> SensingConfig:
@@ -100,6 +149,7 @@ def without_disturbance(sensing: SensingConfig) -> SensingConfig:
 
 
 LENGTH: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+EXTENTS: Final = {**LENGTH, "px": math.nan}
 SHARE: Final = {"%": 1e-2, "": 1.0}
 NUMBER: Final = {"": 1.0}
 TIME: Final = {"ms": 1e-3, "s": 1.0}
@@ -110,7 +160,7 @@ class SensorAxis(NamedTuple):
     """A word for one setting of a sensor.
 
     Attributes:
-        units: its units with their sizes in SI units; the empty one for a plain number.
+        units: its units with their sizes in SI units, NaN of pixels; the empty one for a plain number.
         example: of a magnitude.
         setting: its key in `SensingConfig`.
         family: the family of noise that it chooses; None for none.
@@ -126,8 +176,8 @@ SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {
     "mixture": SensorAxis(SHARE, "10%", "noise_share", "mixture"),
     "bimodal": SensorAxis(SHARE, "10%", "noise_share", "bimodal"),
     "stable": SensorAxis(NUMBER, "1.5", "stability", "stable"),
-    "uniform": SensorAxis(LENGTH, "2mm", "feature_noise", "uniform"),
-    "quantised": SensorAxis(LENGTH, "5mm", "quantum"),
+    "uniform": SensorAxis(EXTENTS, "2mm", "feature_noise", "uniform"),
+    "quantised": SensorAxis(EXTENTS, "5mm", "quantum"),
     "outliers": SensorAxis(SHARE, "40%", "outliers"),
     "occlusions": SensorAxis(SHARE, "20%", "occlusions"),
     "lost_frames": SensorAxis(SHARE, "20%", "drop_probability"),
@@ -138,24 +188,21 @@ SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {
 }
 
 
-def sensor_settings(axes: Iterable[tuple[str, float]]) -> dict[str, float | str]:
+def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, float | str]:
     """Return the settings of a sensor that some axes stand for, by their names in `SensingConfig`.
 
     Args:
-        axes: names of `SENSOR_AXES` with magnitudes in SI units.
+        axes: names of `SENSOR_AXES` with magnitudes as they were written, and in SI units or as texts in pixels.
 
     Raises:
         ValueError: a magnitude out of the bounds of its setting, or two families of noise.
     """
     changes: dict[str, Any] = {}
     families: list[Family] = []
-    for name, size in axes:
+    for name, written, size in axes:
         axis = SENSOR_AXES[name]
         own: dict[str, Any] = {axis.setting: size}
-        try:
-            SensingConfig(**own)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
+        check_field(name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size)
         changes |= own
         if axis.family is not None:
             families.append(axis.family)
@@ -238,11 +285,11 @@ def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
     return math.sqrt(3.0) * (2.0 * generator.random(shape) - 1.0)
 
 
-def family_of(config: SensingConfig) -> Draw:
+def family_of(config: SensingConfig, extents: Extents) -> Draw:
     """Return the noise of a sensor with settings `config`, in multiples of its deviation σ; a row for each family."""
     share, offset = config.noise_share, 0.0
-    if config.feature_noise > 0.0:
-        offset = config.noise_offset / config.feature_noise
+    if extents.feature_noise > 0.0:
+        offset = extents.noise_offset / extents.feature_noise
     families: dict[Family, Draw] = {
         "white": np.random.Generator.standard_normal,
         "mixture": partial(mixture, share=share, offset=offset, spread=config.noise_spread),

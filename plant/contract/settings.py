@@ -13,21 +13,52 @@ Rules across fields stand in `__post_init__` and raise `ValueError`. Validation 
 
 from __future__ import annotations
 
+import ast
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+import inspect
+import logging
+import math
+import operator
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import Field, field, fields, is_dataclass, replace
-from functools import cache, wraps
+from dataclasses import dataclass as plain_dataclass
+from functools import cache, partial, wraps
+from itertools import pairwise
+from multiprocessing import parent_process
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, cast, dataclass_transform, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    NamedTuple,
+    Self,
+    TypeAlias,
+    TypeVar,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_type_hints,
+)
 
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import AllowInfNan, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic import AllowInfNan, BeforeValidator, ConfigDict, PlainValidator, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
-from pydantic_core import PydanticCustomError
+from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.units import EXTENT, alternatives, in_own_unit, in_unit, split_quantity
+
+
+@plain_dataclass(frozen=True)
+class Usual:
+    """The largest usual size of a number, in its annotation; one beyond it is used, with a remark to the user."""
+
+    size: float
+
 
 Number: TypeAlias = Annotated[float, AllowInfNan(False)]
 """A finite number."""
@@ -37,6 +68,10 @@ NonNegative: TypeAlias = Annotated[float, Ge(0.0), AllowInfNan(False)]
 """A finite number, 0 or above."""
 PositiveOrInfinite: TypeAlias = Annotated[float, Gt(0.0)]
 """A number above 0, or `inf` for no limit."""
+JointSpeed: TypeAlias = Annotated[Positive, Usual(20.0)]
+"""The speed of a joint [rad/s]."""
+JointAngle: TypeAlias = Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * math.pi)]
+"""The position of a joint, or a limit of it [rad]."""
 Share: TypeAlias = Annotated[float, Ge(0.0), Le(1.0)]
 """From 0 to 1, both included."""
 ShareBelowOne: TypeAlias = Annotated[float, Ge(0.0), Lt(1.0)]
@@ -59,6 +94,16 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
         raise PydanticCustomError("numbers", "numbers below 1e308") from error
 
 
+def _as_extent(value: Any) -> float | str:  # noqa: ANN401 - as read from a file
+    parts = split_quantity(value) if isinstance(value, str) else (value, "")
+    number = parts[0] if parts is not None and parts[1] == ("px" if isinstance(value, str) else "") else None
+    if not isinstance(number, int | float) or isinstance(number, bool) or not math.isfinite(number):
+        raise PydanticCustomError("extent", "a number of metres or a text such as '2px'")
+    if number < 0.0:
+        raise PydanticKnownError("greater_than_equal", {"ge": 0.0})
+    return f"{number:g}px" if isinstance(value, str) else float(number)
+
+
 def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - as read from a file
     if isinstance(value, np.ndarray) and value.dtype.kind in "bU":
         return value
@@ -75,6 +120,8 @@ Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
 Values: TypeAlias = Annotated[npt.NDArray[Any], BeforeValidator(_as_values)]
 """An array of numbers, of truth values or of texts; in a file, one of them or a list."""
+Extent: TypeAlias = Annotated[NonNegative | str, PlainValidator(_as_extent)]
+"""A number, 0 or above, or a text such as "2px"."""
 File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)]
 """The path of a file."""
 
@@ -83,11 +130,12 @@ Config = TypeVar("Config")
 
 MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
-    "greater_than": ("gt", "above"),
-    "greater_than_equal": ("ge", "at least"),
-    "less_than": ("lt", "below"),
-    "less_than_equal": ("le", "at most"),
+    "greater_than": ("gt", "above", operator.gt),
+    "greater_than_equal": ("ge", "at least", operator.ge),
+    "less_than": ("lt", "below", operator.lt),
+    "less_than_equal": ("le", "at most", operator.le),
 }
+UNIT: Final = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the begin of a string below a field
 _WANTED = {
     "finite_number": "finite",
     "float_type": "a number",
@@ -135,7 +183,8 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
     Args:
         name: of the section, for error messages.
         default: any frozen dataclass; fields that are dataclasses are sections of their own.
-        values: lists become tuples, whole numbers are taken for numbers, true and false are not.
+        values: lists become tuples, whole numbers are taken for numbers, true and false are not, and a number may be
+            a text with its unit, such as "80ms".
 
     Raises:
         ValueError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
@@ -151,10 +200,7 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
                 raise ValueError(f"{name}.{key} is a section of its own, got {value!r}")
             changes[key] = override(f"{name}.{key}", present, value)
         else:
-            try:
-                changes[key] = _adapters(cast(Any, type(default)))[key].validate_python(_with_tuples(value))
-            except ValidationError as error:
-                raise ValueError(describe(error, f"{name}.{key}")) from None
+            changes[key] = check_field(f"{name}.{key}", type(default), key, value)
     try:
         return replace(cast(Any, default), **changes) if changes else default
     except ValueError as error:
@@ -201,33 +247,151 @@ def _with_tuples(value: object) -> object:
     return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
+class Check(NamedTuple):
+    """How a value is checked: its type with bounds, and the largest usual size of its numbers; None for any."""
+
+    type: TypeAdapter[Any]
+    usual: float | None
+
+    @classmethod
+    def of(cls, hint: Any) -> Self:  # noqa: ANN401 - any annotation
+        """Return the check of an annotation, which may have a `Usual`."""
+        return cls(TypeAdapter(hint, config=STRICT), _usual(hint))
+
+
 @cache
-def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
-    """Return a validator for each field that is not a section."""
+def _checks(kind: type) -> dict[str, Check]:
+    """Return the check of each field that is not a section."""
     hints = get_type_hints(kind, include_extras=True)
     types = {item.name: hints[item.name] for item in fields(kind)}
-    return {key: TypeAdapter(hint, config=STRICT) for key, hint in types.items() if not is_dataclass(hint)}
+    return {key: Check.of(hint) for key, hint in types.items() if not is_dataclass(hint)}
 
 
-def describe(error: ValidationError, name: str = "") -> str:
+@cache
+def _unit(kind: type, key: str) -> str:
+    """Return the unit of a field; empty where none is told."""
+    return UNIT.fullmatch(field_strings(kind).get(key, ""))[1] or ""  # type: ignore[index]
+
+
+@cache
+def field_strings(kind: type[Any]) -> dict[str, str]:
+    """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
+    strings = {}
+    for each in reversed(kind.__mro__[:-1]):
+        try:
+            source = inspect.getsource(each)
+        except (OSError, TypeError):  # the class was typed in, or is not written in Python
+            continue
+        definition = ast.parse(textwrap.dedent(source)).body[0]
+        for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
+            if (
+                isinstance(item, ast.AnnAssign)
+                and isinstance(item.target, ast.Name)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+                and isinstance(below.value.value, str)
+            ):
+                strings[item.target.id] = " ".join(below.value.value.split())
+    return strings
+
+
+def check_field(name: str, kind: type[Any], key: str, given: object) -> Any:  # noqa: ANN401 - any setting
+    """Return the checked value of a field of a settings class, which is no section; see `read_value`."""
+    return read_value(name, given, _checks(cast(Any, kind))[key], partial(_unit, cast(Any, kind), key))
+
+
+def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) -> Any:  # noqa: ANN401 - as checked
+    """Return a checked value, and remark on an unusual one.
+
+    Args:
+        name: for messages.
+        given: as TOML has it; numbers may be texts with their unit.
+        check: its type.
+        unit: returns the own unit of its numbers; empty for none.
+
+    Raises:
+        ValueError: another type, out of bounds, or in a unit that does not fit; in the unit in which it was written.
+    """
+    written = _with_tuples(given)
+    try:
+        value = check.type.validate_python(_in_own_unit(name, written, unit))
+    except ValidationError as error:
+        raise ValueError(describe(error, name, written, unit())) from None
+    most = check.usual
+    unusual = [] if most is None else [each for each in _numbers_in(value) if abs(each) > most]
+    if unusual and most is not None:
+        meant = likely_meant(unusual[0], unit(), lambda other: abs(other) <= most)
+        remark(f"{name} is {unusual[0]:g}, and usually at most {f'{most:g} {unit()}'.removesuffix(' 1')}{meant}")
+    return value
+
+
+@cache
+def remark(text: str) -> None:
+    """Print a remark for the user on standard error, once; worker processes leave it to the one that started them."""
+    if parent_process() is None:
+        logging.getLogger("servobench").warning("servobench: note: %s", text)
+
+
+def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
+    """Return numbers in place of texts that are numbers with a unit."""
+    if isinstance(written, tuple):
+        return tuple(_in_own_unit(name, each, unit) for each in written)
+    parts = split_quantity(written) if isinstance(written, str) else None
+    if parts is None or not unit() or (unit() == EXTENT and parts[1] == "px"):
+        return written
+    try:
+        number = in_own_unit(*parts, unit())
+    except ValueError as error:
+        raise ValueError(f"{name} must be {error}, got {written!r}") from None
+    return int(number) if number.is_integer() else number
+
+
+def _usual(hint: Any) -> float | None:  # noqa: ANN401 - any annotation
+    """Return the largest usual size in an annotation, or in that of its items."""
+    found = (each.size if isinstance(each, Usual) else _usual(each) for each in get_args(hint))
+    return next((size for size in found if size is not None), None)
+
+
+def _numbers_in(value: object) -> Iterator[float]:
+    if isinstance(value, tuple):
+        for each in value:
+            yield from _numbers_in(each)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def likely_meant(number: float, unit: str, fits: Callable[[float], bool]) -> str:
+    """Return the remedy for a plain number that may have been meant in another unit, such as millimetres."""
+    meant = [text for text, value in alternatives(number, unit) if fits(value)]
+    return f"; if {' or '.join(meant)} is meant, write the unit, too" if meant else ""
+
+
+def describe(error: ValidationError, name: str = "", written: object = None, unit: str = "") -> str:
     """Return the first complaint of pydantic as one line: field, wanted and given value.
 
     Args:
         error: raised by pydantic.
         name: of the checked object, in front of the field.
+        written: the value as the user wrote it; numbers may be texts with a unit.
+        unit: own unit of the number.
     """
     first = error.errors(include_url=False)[0]
+    for place in first["loc"]:
+        written = written[place] if isinstance(written, tuple) and isinstance(place, int) else written
     name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])
     kind, context, came = first["type"], first.get("ctx", {}), first["input"]
     if kind == "value_error":
         return " ".join(str(context["error"]).split())
     if kind in _BOUNDS:
-        key, word = _BOUNDS[kind]
-        wanted = f"{word} {context[key]:g}"
-    elif kind == "literal_error":
+        key, word, within = _BOUNDS[kind]
+        if isinstance(written, str) and (parts := split_quantity(written)) and parts[1]:
+            return f"{name} must be {word} {in_unit(context[key], parts[1], unit):g}{parts[1]}, got {written}"
+        meant = likely_meant(came, unit, lambda other: within(other, context[key]))
+        return f"{name} must be {word} {context[key]:g}, got {came!r}{meant}"
+    if kind == "literal_error":
         words = context["expected"].replace("'", "").replace(" or ", ", ")
         return f"{name} must be one of {words}, got {came!r}{did_you_mean(str(came), words.split(', '))}"
-    elif kind == "too_short":
+    if kind == "too_short":
         wanted = f"of length {context['min_length']} or more"
     elif kind in {"unexpected_keyword_argument", "missing"}:
         return f"{name}: {first['msg']}"

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from annotated_types import Len
 
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, nested, settings
+from servobench.plant.contract.settings import Count, JointSpeed, NonNegative, Number, Positive, Usual, nested, settings
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.camera import FieldOfView, PinholeCamera
@@ -23,11 +23,11 @@ BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 class RenderedConfig:
     """Settings of a rendered plant; the defaults of loads and drives are a UR5's, and change with the robot."""
 
-    max_joint_speed: Positive = 1.0
+    max_joint_speed: JointSpeed = 1.0
     """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
-    joint_range: Positive = 2 * math.pi
+    joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
     """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
-    lag: NonNegative = 0.05
+    lag: Annotated[NonNegative, Usual(1.0)] = 0.05
     """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
     drives: DriveConfig = nested(DriveConfig)
     """Loops, torque limits, friction and load of the joints."""

@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeAlias
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
-from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, settings
+from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
 MAX_PART: Final = 0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
@@ -37,9 +37,9 @@ class Tool(NamedTuple):
 class MechanicsConfig:
     """Settings of gears and tool; all off by default."""
 
-    backlash: NonNegative = 0.0
+    backlash: Annotated[NonNegative, Usual(0.5)] = 0.0
     """[rad] b: half of the play between each gear and its joint."""
-    ripple: NonNegative = 0.0
+    ripple: Annotated[NonNegative, Usual(0.5)] = 0.0
     """[rad] a: each gear leads by a sin(k q)."""
     ripple_order: Positive = 8.0
     """[1] k, periods of the ripple in a turn."""

@@ -29,10 +29,10 @@ from typing import Self
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE, sensor_settings
-from servobench.plant.contract.settings import nearest, suggest
+from servobench.plant.contract.settings import likely_meant, nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
 from servobench.plant.robot.mechanics import MECHANICS_AXES
@@ -79,10 +79,13 @@ class Mismatch:
             size = magnitude.size(axis)
             if axis in SENSOR_AXES or axis in MECHANICS_AXES:
                 continue
-            if AXES[axis][0] is SHARE:
-                check_number(axis, size, at_least=0.0, below=1.0)
-            else:
-                check_number(axis, size, at_least=0.0, at_most=MAX_SIZE.get(next(iter(AXES[axis][0])), math.pi))
+            units = AXES[axis][0]
+            most = 1.0 if units is SHARE else MAX_SIZE.get(next(iter(units)), math.pi)
+            if not 0.0 <= size <= most or (units is SHARE and size == most):
+                bound = replace(magnitude, number=round(most / units[magnitude.unit], 9))
+                meant = likely_meant(magnitude.number, "" if magnitude.unit else "1", most.__gt__)
+                wanted = "below" if units is SHARE else "at most"
+                raise ValueError(f"{axis} must be at least 0 and {wanted} {bound}, got {magnitude}{meant}")
         _ = self.plant_settings
 
     @classmethod
@@ -132,7 +135,11 @@ class Mismatch:
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
-        axes = [(axis, magnitude.size(axis)) for axis, magnitude in self.axes if axis in SENSOR_AXES]
+        axes = [
+            (axis, str(magnitude), str(magnitude) if magnitude.unit in PIXELS else magnitude.size(axis))
+            for axis, magnitude in self.axes
+            if axis in SENSOR_AXES
+        ]
         own = {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
         mechanical = {
             MECHANICS_AXES[axis].setting: each.size(axis) for axis, each in self.axes if axis in MECHANICS_AXES
@@ -382,6 +389,8 @@ class Magnitude:
 
 def _not_a_magnitude(axis: str, text: str) -> ValueError:
     units, example = AXES[axis]
+    if re.fullmatch(r"\s*-\s*[0-9.]+\s*[a-z%]*\s*", text):
+        return ValueError(f"{axis} has no sign, as each robot draws one where there is one; got {text!r}")
     names = ", ".join(repr(unit) if unit else "none" for unit in units)
     return ValueError(
         f"mismatch axis {axis} needs a magnitude with one of the units {names}, such as {axis}={example}; got {text!r}"

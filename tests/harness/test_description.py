@@ -65,7 +65,7 @@ def test_changed_settings_are_kept_and_their_defaults_told(monkeypatch, capsys, 
     lines = path.read_text(encoding="utf-8").splitlines()
     at = lines.index("feature_noise = 0.5")
     told = " ".join(line.removeprefix("# ") for line in lines[at - 2 : at])
-    assert told.startswith("[m] standard deviation")
+    assert told.startswith("[m or px] standard deviation")
     assert told.endswith("(≥ 0; default 0.001)")
     assert max(map(len, (line for line in lines if line.startswith("#")))) <= 120
 

@@ -51,7 +51,7 @@ def test_the_text_of_a_mismatch_is_read_and_a_bad_one_refused():
 def test_a_run_has_whole_periods():
     assert RunSettings(period=0.05).periods(10.0) == 200
     assert RunSettings(period=0.3).periods(1.0) == 4
-    with pytest.raises(ValueError, match="period must be above 0"):
+    with pytest.raises(ValueError, match="period must be at least"):
         RunSettings(period=0.0)
 
 

@@ -319,3 +319,20 @@ def test_networks_are_trained_on_the_features_of_a_set_up():
 
 def test_names_of_all_set_ups_are_found():
     assert [str(find_sensing(word)) for word in sensing_names()] == sensing_names()
+
+
+@pytest.mark.parametrize("robot", ["ur5", "ur10e", "panda"])
+@pytest.mark.parametrize("sensing", ["pixel", "pixel:hand"])
+def test_noise_in_pixels_is_logged_in_pixels(robot, sensing):
+    noise = {"kinematic": {"sensing": {"feature_noise": "2px"}, "command_delay": 0.0}, "circle": {"laps": 10}}
+    steps = servobench.run(
+        "constant", task="circle", robot=robot, sensing=sensing, mismatch="none", settings=noise
+    ).steps
+    apart = np.concatenate([steps[f"feature_{each}_px"] - steps[f"true_feature_{each}_px"] for each in "uv"])
+    assert len(apart) > 3000
+    assert apart.std() == pytest.approx(2.0, abs=0.1)
+
+
+def test_noise_that_could_be_pixels_is_refused_as_metres():
+    with pytest.raises(ConfigurationError, match="above a tenth of 320 px: a plain number is in metres; for pixels"):
+        servobench.run("constant", sensing="pixel", settings={"kinematic": {"sensing": {"feature_noise": 2}}})

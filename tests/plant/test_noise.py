@@ -198,8 +198,8 @@ def test_a_word_of_the_sensor_sets_its_setting_and_draws_no_other_robot(axis):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("outliers=100%", "outliers: outliers must be below 1, got 1"),
-        ("stable=0", "stable: stability must be at least 0.5, got 0"),
+        ("outliers=100%", "outliers must be below 100%, got 100%"),
+        ("stable=0", "stable must be at least 0.5, got 0"),
         ("stable=1.5+mixture=10%", "noise is of one family, got stable and mixture; give one of them"),
         ("jitter=3deg", "jitter needs a magnitude with one of the units 'ms', 's', such as jitter=100ms; got '3deg'"),
         ("outlier=3%", "did you mean 'outliers'?"),

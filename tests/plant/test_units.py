@@ -1,0 +1,84 @@
+"""Quantities are read in any of their units, and answered in the unit in which they were written."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+
+import pytest
+
+from servobench.harness.config.settings import read_settings
+from servobench.harness.run.request import RunSettings
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import remark
+from servobench.plant.contract.units import UNITS, in_own_unit, in_unit, split_quantity, units_of
+from servobench.plant.kinematic import KinematicConfig
+
+DEFAULTS = {"kinematic": KinematicConfig(), "run": RunSettings()}
+
+
+def read(assignment):
+    section = assignment.partition(".")[0]
+    return read_settings(None, [assignment]).resolve(section, DEFAULTS[section])
+
+
+@pytest.mark.parametrize("own", UNITS)
+def test_a_number_survives_its_way_through_every_unit(own):
+    for unit in units_of(own):
+        assert in_own_unit(in_unit(0.8, unit, own), unit, own) == pytest.approx(0.8, rel=1e-15)
+
+
+def test_decimal_parts_are_the_numbers_that_they_are_written_as():
+    for k in range(1000):
+        assert in_own_unit(*split_quantity(f"{k}ms"), "s") == float(f"{k}e-3")
+    assert in_own_unit(*split_quantity("90 °"), "rad") == math.pi / 2
+    assert in_own_unit(*split_quantity("125Hz"), "s") == 0.008
+
+
+def test_settings_take_units():
+    config = read("kinematic.sensing.latency=80ms")
+    assert config.sensing.latency == 0.08
+    assert read("kinematic.sensing.occlusion_windows=[['100ms', 0.5]]").sensing.occlusion_windows == ((0.1, 0.5),)
+    assert read("kinematic.sensing.feature_noise=2px").sensing.feature_noise == "2px"
+    assert read("kinematic.sensing.feature_noise=2mm").sensing.feature_noise == 0.002
+    assert read("run.period=125Hz").period == 0.008
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("kinematic.lag=-80ms", "kinematic.lag must be at least 0ms, got -80ms"),
+        ("kinematic.lag=5deg", "kinematic.lag must be a number in s, ms, us, min, Hz, got '5deg'"),
+        ("kinematic.lag=0,05", "kinematic.lag must be a number in s, ms, us, min, Hz, got '0,05'"),
+        ("kinematic.lag=fast", "kinematic.lag must be a number, got 'fast'"),
+        ("kinematic.max_joint_speed=-57deg/s", "kinematic.max_joint_speed must be above 0deg/s, got -57deg/s"),
+        (
+            "kinematic.sensing.drop_probability=5",
+            "kinematic.sensing.drop_probability must be below 1, got 5; if 5% is meant, write the unit, too",
+        ),
+        ("kinematic.sensing.drop_probability=120%", "drop_probability must be below 100%, got 120%"),
+        ("kinematic.sensing.feature_noise=-2px", "feature_noise must be at least 0"),
+        ("kinematic.sensing.feature_noise=2kg", "feature_noise must be a number in m, cm, mm, px, got '2kg'"),
+        ("run.period=1e-9", "run.period must be at least 0.0001, got 1e-09"),
+    ],
+)
+def test_a_refusal_is_in_the_unit_that_was_written(assignment, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        read(assignment)
+
+
+def test_a_rare_value_is_used_with_one_remark(caplog):
+    remark.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        assert read("kinematic.max_joint_speed=57").max_joint_speed == 57.0
+        read("kinematic.max_joint_speed=57")
+    (line,) = caplog.messages
+    assert "kinematic.max_joint_speed is 57, and usually at most 20 rad/s; if 57deg/s is meant, write the unit" in line
+
+
+def test_pixels_are_pixels_where_features_are():
+    config = SensingConfig(feature_noise="2px", quantum="1px")
+    assert config.extents("px", 160.0)[:4] == (0.0125, 0.02, 0.00625, 0.05)
+    with pytest.raises(ValueError, match=r"sensing.feature_noise is 2px, but the features are in m; write it in m"):
+        config.extents("m", 1.0)
