@@ -32,6 +32,7 @@ HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 ERROR_MARGIN: Final = 0.04  # of the settling band: 0.2 mm of 5 mm
 BOUND_MARGIN: Final = 0.1  # of the error of a controller that knows the robot
 SHARE_MARGIN: Final = 0.01
+SECOND_LAP: Final = "rms_error_second_lap"
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
 
 
@@ -150,6 +151,12 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
     """Return the label of a metric with the unit in which it is shown for these runs."""
     unit, _ = shown_unit(name, runs)
     return METRICS[name].label if unit == "1" else f"{METRICS[name].label} [{unit}]"
+
+
+def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
+    """Return whether a metric repeats another one: these runs have no second lap, or it is the judged part."""
+    judged, second = column_of(runs, "rms_error_evaluated"), column_of(runs, SECOND_LAP)
+    return name == SECOND_LAP and (second.isna().all() or second.equals(judged.rename(SECOND_LAP)))
 
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:

@@ -25,6 +25,7 @@ from servobench.harness.analysis.comparison import (
     compare_pairs,
     grouped,
     in_handy_units,
+    is_superfluous,
     margin,
     metric_heading,
     outcomes,
@@ -115,7 +116,7 @@ def statistics_tables(runs: pd.DataFrame, metric: str | None = None) -> Tables:
         yield words, as_text(controllers)
         if pairs:
             table = as_text(pairs)
-            yield f"pairs, verdicts with a margin of {table.pop('margin')[0]}", table
+            yield f"paired differences, verdicts with a margin of {table.pop('margin')[0]}", table
 
 
 def statistics_rows(runs: pd.DataFrame, metric: str | None = None) -> Iterator[tuple[str, list[Row], list[Row]]]:
@@ -125,21 +126,29 @@ def statistics_rows(runs: pd.DataFrame, metric: str | None = None) -> Iterator[t
 
 
 def _controller_rows(runs: pd.DataFrame) -> list[Row]:
-    unit, factor = shown_unit("steady_state_error", runs)
+    heading = {name: metric_heading(name, runs) for name in METRICS}
+    judged = "rms_error_evaluated" if achievement(runs) == FOLLOWED else "steady_state_error"
+    factor = shown_unit(judged, runs)[1]
     rows: list[Row] = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
-        final = column_of(own, "steady_state_error").where(own["status"] == COMPLETED)
+        error = factor * column_of(own, judged).where(own["status"] == COMPLETED)
+        row = {
+            "controller": Cell(str(name)),
+            "runs": Cell(len(own)),
+            f"{achievement(runs)} [%]": Cell(achieved_share(own), ".1f"),
+        }
+        if judged == "steady_state_error":
+            row |= {
+                heading["settling_time_s"]: Cell(_median(settling_times(own)), ".2f"),
+                heading["overshoot"]: Cell(_median(100.0 * column_of(own, "overshoot")), ".1f"),
+            }
         rows.append(
-            {
-                "controller": Cell(str(name)),
-                "runs": Cell(len(own)),
-                f"{achievement(runs)}, %": Cell(achieved_share(own), ".1f"),
-                "settling time, s": Cell(_median(settling_times(own)), ".2f"),
-                "overshoot, %": Cell(_median(100.0 * column_of(own, "overshoot")), ".1f"),
-                f"RMS end, {unit}": Cell(_median(factor * column_of(own, "rms_error_evaluated")), ".1f"),
-                f"worst 5 %, {unit}": Cell(factor * tail_mean(final, TAIL), ".1f"),
+            row
+            | {
+                heading[judged]: Cell(_median(error), ".1f"),
+                f"its worst 5 % {heading[judged].rpartition(' ')[2]}": Cell(tail_mean(error, TAIL), ".1f"),
                 "failures": Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none"),
             }
         )
@@ -160,14 +169,14 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     label, (unit, factor) = metric.replace("_", " "), ("1", 1.0)
     if metric in METRICS:
         label, (unit, factor) = METRICS[metric].label, shown_unit(metric, runs)
-    difference = f"mean difference in {label}" if unit == "1" else f"mean difference in {label}, {unit}"
+    difference = f"mean difference in {label}" if unit == "1" else f"mean difference in {label} [{unit}]"
     return [
         {
-            "pair": Cell(f"{first} − {second}"),
-            "lost": Cell("{} : {}".format(*each.lost)),
+            "A − B": Cell(f"{first} − {second}"),
+            "runs lost": Cell("{} : {}".format(*each.lost)),
             difference: Cell(each.mean.scaled(factor), ".2f"),
             "verdict": Cell(each.verdict),
-            "P(better)": Cell(each.probability, ".2f"),
+            "P(A better)": Cell(each.probability, ".2f"),
             "margin": Cell(f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")),
         }
         for (first, second), each in zip(pairs, compared, strict=True)
@@ -180,24 +189,30 @@ def _median(values: pd.Series[float]) -> Estimate:
 
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return the meaning of the good outcomes; the table of runs comes in pieces."""
-    bands = pd.concat([part.reindex(columns=list(BAND)).drop_duplicates() for part in parts])
-    return (
-        f"{SETTLED}: came within {settling_band(bands)} and stayed; "
-        f"{FOLLOWED}: RMS error of the judged part at most {settling_band(bands, FOLLOWING_BANDS)}"
-    )
+    """Return the meaning of the good outcomes that these runs can have, a line each; the table of runs has parts."""
+    known = pd.concat([part.reindex(columns=[*BAND, "task_kind"]).drop_duplicates() for part in parts])
+    lines = {
+        POINT_TO_POINT: f"{SETTLED}: came within {settling_band(known)} and stayed",
+        CURVE: f"{FOLLOWED}: {METRICS['rms_error_evaluated'].label} at most {settling_band(known, FOLLOWING_BANDS)}",
+    }
+    return "\n".join(line for kind, line in lines.items() if (known["task_kind"] == kind).any())
 
 
 def summary_legend(runs: pd.DataFrame) -> str:
-    """Return the meaning of the words in `summary_tables`."""
-    late = f"; {LATE} some steps took longer than the period" if _is_late(runs) else ""
-    switches = "switches: joint commands that change sign between large values within two periods"
-    return f"{outcome_legend([runs])}; over: overshoot; {switches}; numbers are medians over runs{late}"
+    """Return the meaning of the words in `summary_tables`, a line each."""
+    lines = [
+        outcome_legend([runs]),
+        "judged part: the last lap; of a line, the second half" * (len(split_tasks(runs)[1]) > 0),
+        "sign switches: large joint commands of opposite sign within two periods",
+        "numbers: medians over runs" * (len(runs) > 1),
+        f"{LATE} some steps took longer than the period" * _is_late(runs),
+    ]
+    return "\n".join(filter(None, lines))
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return the meaning of the words in `sweep_tables`."""
-    return f"{outcome_legend(parts)}; noise: factor; latency, period: ms, – as configured"
+    """Return the meaning of the words in `sweep_tables`, a line each."""
+    return f"{outcome_legend(parts)}\n{MISSING} as configured".lstrip()
 
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
@@ -206,14 +221,17 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
         known = [(column, metric.summary) for column, metric in METRICS.items() if metric.summary]
         own_first = sorted(known, key=lambda pair: pair[1].kind is None)
-        summaries = [(column, summary) for column, summary in own_first if summary.kind in (kind, None)]
+        summaries = [
+            (column, summary)
+            for column, summary in own_first
+            if summary.kind in (kind, None) and not is_superfluous(column, place)
+        ]
         rows = []
         for name, own in place.groupby("controller", sort=False):
             row = {"controller": str(name), "outcome": _shares(own)}
             for column, summary in summaries:
-                unit, factor = shown_unit(column, place)
-                heading = summary.heading if unit == "1" else f"{summary.heading}\n{unit}"
-                row[heading] = _middle(own, column, factor, summary.digits)
+                heading = metric_heading(column, place)
+                row[heading] = _middle(own, column, shown_unit(column, place)[1], summary.digits)
                 if column == STEP_TIME and _is_late(own):
                     row[heading] += LATE
             rows.append(row)
@@ -246,13 +264,13 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
         word = FOLLOWED if task in curves else SETTLED
         shares = table.rename_axis(columns=None).reset_index()
-        if (shares["period"] == MISSING).all():
-            del shares["period"]
-        yield f"{task} on {plant}: {word}, %", shares
+        if (shares[SHORT_NAMES["period"].heading] == MISSING).all():
+            del shares[SHORT_NAMES["period"].heading]
+        yield f"{task} on {plant}: {word} [%]", shares
         if good.sum() < place["runs"].sum():
             kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
             table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
-            yield f"{task} on {plant}: outcomes of the runs, %", table.rename_axis(columns=None).reset_index()
+            yield f"{task} on {plant}: outcomes of the runs [%]", table.rename_axis(columns=None).reset_index()
 
 
 def _percent(value: float) -> str:
@@ -261,7 +279,7 @@ def _percent(value: float) -> str:
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     """Return how many runs of each condition had which outcome: plant, task, conditions, controller, outcome, runs."""
-    varied = {name: (short.column, short.scale) for name, short in SHORT_NAMES.items()}
+    varied = {short.heading: (short.column, short.scale) for short in SHORT_NAMES.values()}
     varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
     texts = {
         name: [shown_value(value, scale, MISSING) for value in runs[column]] for name, (column, scale) in varied.items()
@@ -317,10 +335,9 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
             row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
             table, metric = judged_values(place), judged_metric(place)
-            unit, digits = shown_unit(metric, place)[0], METRICS[metric].digits
-            heading = f"after [{unit}]" if unit == "s" else f"RMS error [{unit}]"
-            row[where, heading] = (
-                f"{median_with_interval(table[name]):.{digits}f}" if name in table and len(table) else MISSING
+            digits, known = METRICS[metric].digits, name in table and len(table)
+            row[where, metric_heading(metric, place)] = (
+                f"{median_with_interval(table[name]):.{digits}f}" if known else MISSING
             )
         rows.append(row)
     return grouped(rows)
@@ -451,7 +468,7 @@ def _columns(kind: str, runs: pd.DataFrame) -> list[tuple[str, str]]:
         (group, name)
         for group in GROUPS[kind]
         for name, metric in METRICS.items()
-        if metric.tables.get(kind) == group and column_of(runs, name).notna().any()
+        if metric.tables.get(kind) == group and column_of(runs, name).notna().any() and not is_superfluous(name, runs)
     ]
 
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
@@ -25,9 +26,16 @@ INPUT_ERROR = 2  # exit code
 INTERRUPTED = 130  # exit code after Ctrl-C
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
-KEYS = ("controller", "mismatch", "noise", "latency", "period", "pair")  # first columns, by which a row is known
+KEYS = (
+    "controller",
+    "mismatch",
+    "noise factor",
+    "latency [ms]",
+    "period [ms]",
+    "A − B",
+)  # first columns, by which a row is known
 LEFT = (*KEYS, "failures", "outcome")  # columns of words
-WHOLE = ("controller", "pair")  # columns whose cells are not broken over lines
+WHOLE = ("controller", "A − B")  # columns whose cells are not broken over lines
 CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
 GAP = 2  # [characters] that a table needs for each column beside its cells
 
@@ -90,20 +98,21 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
+    from rich.text import Text
 
     for title, rows in tables:
         for number, widths in enumerate(_fit(rows, console.width)):
             table = Table(
-                title=None if number else title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False,
+                title=None if number else Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False,
                 padding=(0, 1, 0, 0),
             )  # fmt: skip
             for name, width in widths.items():
-                table.add_column(name, justify="left" if name in LEFT else "right", width=width, overflow="fold")
+                table.add_column(Text(name), justify="left" if name in LEFT else "right", width=width, overflow="fold")
             for row in rows[list(widths)].itertuples(index=False):
-                table.add_row(*row)
+                table.add_row(*map(Text, row))
             console.print(table)
     if legend:
-        console.print(legend)
+        console.print(legend, markup=False, highlight=False)
 
 
 def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
@@ -119,19 +128,24 @@ def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
     part = list(keys)
     for name in names[len(keys) :]:
         if len(part) > len(keys) and sum(least[each] + GAP for each in (*part, name)) > room:
-            yield _shares(part, least, whole, room)
+            yield _shares(rows[part], least, whole, room)
             part = list(keys)
         part.append(name)
-    yield _shares(part, least, whole, room)
+    yield _shares(rows[part], least, whole, room)
 
 
-def _shares(names: list[str], least: dict[str, int], whole: dict[str, int], room: int) -> dict[str, int]:
-    """Return the widths of columns in one table: the widest ones give way first."""
+def _shares(rows: pd.DataFrame, least: dict[str, int], whole: dict[str, int], room: int) -> dict[str, int]:
+    """Return the widths of columns in one table: the widest give way first, and those of most lines get the rest."""
+    names = list(rows.columns)
     widths = {name: whole[name] for name in names}
     for most in range(max(widths.values()), 0, -1):
         if sum(widths.values()) + GAP * len(names) <= room:
             break
         widths = {name: max(least[name], min(whole[name], most)) for name in names}
+    for _ in range(room - sum(widths.values()) - GAP * len(names)):
+        lines = {name: max(len(wrap(cell, widths[name])) for cell in (name, *rows[name])) for name in names}
+        highest = max(names, key=lambda name: lines[name] * (widths[name] < whole[name]))
+        widths[highest] += widths[highest] < whole[highest]
     return widths
 
 

@@ -66,13 +66,15 @@ class NamedFigure(NamedTuple):
 
 
 def draw_figures(folder: Path) -> list[Path]:
-    """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG and PDF.
+    """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG.
 
     Raises:
         ConfigurationError: not a results folder.
     """
     return [
-        path for named in folder_figures(folder) for path in save_figure(named.figure, folder / FOLDER / named.stem)
+        path
+        for named in folder_figures(folder)
+        for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
     ]
 
 

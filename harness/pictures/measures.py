@@ -16,7 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pandas.api.types import is_numeric_dtype
 
-from servobench.harness.analysis.comparison import CURVE, settled_share, settling_times, shown_unit, texts_of
+from servobench.harness.analysis.comparison import (
+    CURVE,
+    metric_heading,
+    settled_share,
+    settling_times,
+    shown_unit,
+    texts_of,
+)
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.style import (
     LETTER,
@@ -153,7 +160,7 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
     plain_logarithms(axes, "x")
-    axes.set_xlabel("time of a controller's step [ms]" if layout is WIDE else "time of a step [ms]")
+    axes.set_xlabel("step of the controller [ms]")
     axes.set_xlim(right=top)
     _name_rows(axes, list(known), layout)
     return figure
@@ -179,14 +186,9 @@ def _short(milliseconds: float) -> str:
 
 
 def _label(column: str, runs: pd.DataFrame) -> str:
-    """Return the label of a metric with its unit; in a figure it has room for more words than in a table."""
-    unit, name = shown_unit(column, runs)[0], METRICS[column].label
-    if column == "rms_error_evaluated":
-        name = "RMS error of the judged part"
-        name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""
-    if column == "command_switches":
-        name, unit = "sign switches of large commands", "count"
-    return f"{name} [{unit}]"
+    """Return the label of an axis, which has a unit in any case."""
+    heading = metric_heading(column, runs)
+    return heading if heading.endswith("]") else f"{heading} [1]"
 
 
 def _moves(runs: pd.DataFrame) -> pd.Series[bool]:

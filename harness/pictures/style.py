@@ -253,11 +253,11 @@ def plain_logarithms(axes: Axes, which: Literal["x", "y"] = "y") -> None:
     axis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
 
 
-def save_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PNG and PDF with the same name; the same figure gives the same bytes."""
+def save_figure(figure: Figure, stem: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+    """Write a figure in each format, by default PNG and PDF, under one name; the same figure gives the same bytes."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths = []
-    for ending in FORMATS:
+    for ending in formats:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
         with figure_style(TEXT):
             metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}

@@ -67,7 +67,6 @@ class Judged:
 class Summary(NamedTuple):
     """A column of the table that a command prints at its end; of one kind of task only, if `kind` says so."""
 
-    heading: str
     digits: int
     kind: TaskKind | None = None
 
@@ -79,7 +78,7 @@ class Metric:
     Attributes:
         column: its name.
         unit: of the column; empty for that of the plant's feature.
-        label: its name in tables and figures.
+        label: its name wherever it is shown: in tables of commands, in the report and in figures.
         digits: behind the decimal point where it is shown.
         meaning: its definition.
         values: of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.outcome`.
@@ -250,7 +249,7 @@ _ALL: Final = (
         "time from which on e stays ≤ `settling_band` to the end, interpolated between two rows; NaN if the last row "
         "is outside, or the error came in less than 0.5 s before the end",
         lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
-        tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary("after", 2, "point_to_point"),
+        tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary(2, "point_to_point"),
     ),
     Metric(
         "settling_time_5pct_s", "s", "settling time, 5 % band", 2,
@@ -262,15 +261,15 @@ _ALL: Final = (
         "how far the feature passes a fixed target: max over k of (y_k − y_0)·w / (w·w) − 1 with w = y_ref − y_0, at "
         "least 0; NaN when the reference moves",
         lambda run: overshoot(run.feature, run.reference[..., 0]) if run.fixed else run.same(np.nan),
-        percent=True, tables={"moves": "Time"}, summary=Summary("over", 0, "point_to_point"),
+        percent=True, tables={"moves": "Time"}, summary=Summary(0, "point_to_point"),
     ),
     Metric(
-        "steady_state_error", "", "last second", 2,
+        "steady_state_error", "", "error of the last second", 2,
         "mean of e over the last second",
-        _steady_state, tables={"moves": "Error", "runs": "Error"},
+        _steady_state, tables={"moves": "Error", "runs": "Error"}, summary=Summary(1, "point_to_point"),
     ),
     Metric(
-        "rms_error", "", "RMS of the run", 2,
+        "rms_error", "", "RMS error of the run", 2,
         "root of the mean of e² over all rows",
         lambda run: _rms(run, run.error),
     ),
@@ -280,16 +279,16 @@ _ALL: Final = (
         lambda run: run.error.max(axis=-1),
     ),
     Metric(
-        "rms_error_second_lap", "", "RMS of the second lap", 2,
+        "rms_error_second_lap", "", "RMS error of the second lap", 2,
         "the same as `rms_error` over the second lap, the first one after the entry; NaN where nothing is repeated",
         lambda run: _rms(run, run.second_lap),
-        tables={"curves": "RMS error"}, summary=Summary("RMS lap 2", 1, "curve"),
+        tables={"curves": "RMS error"}, summary=Summary(1, "curve"),
     ),
     Metric(
-        "rms_error_evaluated", "", "RMS of the judged part", 2,
+        "rms_error_evaluated", "", "RMS error of the judged part", 2,
         "root of the mean of e² over the judged part of the [task](plants.md#tasks); NaN if the run ended before it",
         lambda run: _rms(run, run.evaluated),
-        tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary("RMS end", 1),
+        tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary(1, "curve"),
     ),
     Metric(
         "log_error", "1", "mean logarithmic error", 2,
@@ -306,7 +305,7 @@ _ALL: Final = (
         "max_joint_position_rad", "rad", "largest joint position", 2,
         "largest |q| of all joints and rows, as the encoders report it",
         lambda run: np.abs(_columns(run.steps.joint_position)).max(axis=(-2, -1)),
-        better="", tables={"curves": "Motion"}, summary=Summary("joints", 2, "curve"),
+        better="", tables={"curves": "Motion"}, summary=Summary(2, "curve"),
     ),
     Metric(
         "control_effort_rad", "rad", "control effort", 2,
@@ -348,7 +347,7 @@ _ALL: Final = (
         "how often joints are driven to and fro: periods whose command is at least 10 % of the joint's speed limit and "
         "whose last command of that size, one or two periods before, had the other sign; sum over joints",
         lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
-        tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary("switches", 0),
+        tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary(0),
     ),
     Metric(
         "feature_invalid_fraction", "1", "periods without a feature", 1,
@@ -367,14 +366,14 @@ _ALL: Final = (
         lambda run: _of_known(np.max, _columns(run.steps.jacobian_condition())), better="",
     ),
     Metric(
-        "controller_time_median_us", "µs", "controller step, median", 0,
+        "controller_time_median_us", "µs", "step, median", 0,
         "median of `controller_time_us`; this and the next three are null where runs [advanced "
         "together](experiments.md)",
         lambda run: run.same(float(np.median(run.steps.controller_time))),
-        tables={"cost": "Step of the controller"}, summary=Summary("step", 0),
+        tables={"cost": "Step of the controller"}, summary=Summary(0),
     ),
     Metric(
-        "controller_time_p99_us", "µs", "controller step, 99 %", 0,
+        "controller_time_p99_us", "µs", "step, 99 %", 0,
         "99th percentile of it",
         lambda run: run.same(float(np.quantile(run.steps.controller_time, 0.99))),
         tables={"cost": "Step of the controller"},
@@ -390,13 +389,13 @@ _ALL: Final = (
         lambda run: run.same(float(np.median(run.steps.plant_time))), better="",
     ),
     Metric(
-        "pose_error_mm", "mm", "pose error, last second", 1,
+        "pose_error_mm", "mm", "pose error of the last second", 1,
         "mean distance of the target from its taught position over the last second; a column only of sensing set-ups "
         "that are judged by the pose of a target",
         tables={"moves": "Error"},
     ),
     Metric(
-        "pose_error_deg", "deg", "angle error, last second", 2,
+        "pose_error_deg", "deg", "angle error of the last second", 2,
         "mean rotation of the target from its taught orientation over the last second; likewise",
         tables={"moves": "Error"},
     ),

@@ -29,8 +29,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
     assert manifest["seeds"] == "3"
     assert manifest["packages"]["numpy"]
     figures = {path.stem for path in (out / "figures").glob("*.png")}
-    assert figures == {path.stem for path in (out / "figures").glob("*.pdf")}
-    assert len(figures) == 6
+    assert len(figures) == len(list((out / "figures").iterdir())) == 6
     assert not (out / "report.html").exists()
     assert json.loads(runs["mismatch_values"][0])["camera_angle"] != 0.0
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.folders import comparison, failed_only, made_up_row, sweep
+from servobench.controllers.aids import EQUIPPED
 from servobench.harness.analysis import tables
-from servobench.harness.analysis.folder import describe_folder, describe_settings
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
 from servobench.harness.analysis.verdict import leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES
@@ -27,7 +30,7 @@ def test_a_move_that_never_settled_counts_as_the_last_to_settle():
     assert row["Runs", "settled [%]"] == "67 [21, 94]"  # Wilson
     assert row["Time", "settling time [s]"] == "2.00 [1.00, ∞]"
     assert row["Time", "overshoot [%]"] == "2.0 [2.0, 2.0]"
-    assert row["Error", "last second [mm]"] == "1.00 [1.00, 1.00]"
+    assert row["Error", "error of the last second [mm]"] == "1.00 [1.00, 1.00]"
 
 
 def test_beside_the_medians_of_computing_times_stands_the_share_of_lost_runs():
@@ -44,7 +47,7 @@ def test_moves_stand_apart_by_task_and_curves_beside_them(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     assert list(tables.move_tables(runs)) == ["exp1", "exp2"]
     (table,) = tables.curve_tables(runs).values()
-    assert table["RMS error", "RMS of the judged part [mm]"].tolist() == ["2.00"] * 3
+    assert table["RMS error", "RMS error of the judged part [mm]"].tolist() == ["2.00"] * 3
     assert table["Runs", "followed [%]"].tolist() == ["100 [21, 100]"] * 3
 
 
@@ -81,8 +84,8 @@ def test_only_conditions_that_vary_get_a_column(tmp_path):
 def test_the_overview_has_a_group_for_each_task(tmp_path):
     table = tables.overview(results.load_runs(comparison(tmp_path / "out")))
     assert list(dict.fromkeys(group for group, _ in table.columns)) == ["", "exp1", "exp2", "circle"]
-    assert table["exp1", "after [s]"].tolist() == ["1.50"] * 3
-    assert table["circle", "RMS error [mm]"].tolist() == ["2.00"] * 3
+    assert table["exp1", "settling time [s]"].tolist() == ["1.50"] * 3
+    assert table["circle", "RMS error of the judged part [mm]"].tolist() == ["2.00"] * 3
 
 
 def test_the_overview_of_many_conditions_is_one_group_a_task(tmp_path):
@@ -112,15 +115,15 @@ def test_failures_are_counted_with_a_reason(tmp_path):
 def test_errors_are_in_the_unit_of_the_feature():
     radians = moves(1.0, feature_unit="rad")
     (table,) = tables.move_tables(radians).values()
-    assert table["Error", "last second [rad]"].tolist() == ["0.00"]
+    assert table["Error", "error of the last second [rad]"].tolist() == ["0.00"]
     (both,) = tables.move_tables(pd.concat([moves(1.0), radians.assign(plant="crane")])).values()
     (metres,) = tables.move_tables(moves(1.0)).values()
-    own = [*metres["Error", "last second [mm]"], *table["Error", "last second [rad]"]]
-    assert both["Error", "last second [mm or rad]"].tolist() == own
+    own = [*metres["Error", "error of the last second [mm]"], *table["Error", "error of the last second [rad]"]]
+    assert both["Error", "error of the last second [mm or rad]"].tolist() == own
 
 
 def test_times_that_are_not_known_get_no_column():
-    heading = ("Step of the controller", "controller step, median [µs]")
+    heading = ("Step of the controller", "step, median [µs]")
     assert heading in tables.cost_table(moves(1.0))
     assert heading not in tables.cost_table(moves(1.0, controller_time_median_us=np.nan))
 
@@ -160,3 +163,17 @@ def test_every_place_that_a_metric_names_exists():
     for metric in METRICS.values():
         assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), metric.column
         assert metric.figure in ("", *FIGURES), metric.column
+
+
+def test_a_folder_says_which_of_its_controllers_have_the_aids(monkeypatch):
+    every = {f"aids.{name}": value for name, value in EQUIPPED.items()}
+    sections = {"ukf_mfac": every, "Mine": {"gain": 2.0}, "ukf_mpc": every | {"aids.limit": "scale"}, "run": {}}
+    manifest = {
+        "controllers": ["ukf_mfac", "Mine", "ukf_mpc", "fmu:a.fmu"],
+        "configuration": sections | {"fmu:a.fmu": {}},
+    }
+    monkeypatch.setattr(results, "read_manifest", lambda _: manifest)
+    wanted = "with all aids: ukf_mfac; without aids: Mine; with all aids but limit: ukf_mpc; aids unknown: fmu:a.fmu"
+    assert describe_controllers(Path()) == wanted
+    manifest["controllers"] = ["Mine"]
+    assert describe_controllers(Path()) == ""

@@ -17,6 +17,7 @@ from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.analysis.tables import (
     Cell,
+    curve_tables,
     outcome_legend,
     statistics_tables,
     summary_legend,
@@ -55,28 +56,29 @@ def judge_controllers(runs):
 def compare_controllers(runs, metric=None):
     """Return the table of pairs of one place."""
     _, (title, pairs) = statistics_tables(runs, metric)
-    assert title == f"pairs, verdicts with a margin of {'0.2 mm' if (runs['task_kind'] == 'curve').all() else '0.05 s'}"
+    margin = "0.2 mm" if (runs["task_kind"] == "curve").all() else "0.05 s"
+    assert title == f"paired differences, verdicts with a margin of {margin}"
     return pairs
 
 
 def test_each_controller_has_rates_medians_tails_and_failures(runs):
     quick, slow = judge_controllers(runs).to_dict("records")
-    assert quick["settled, %"] == "100.0 [83.9, 100.0]"  # Wilson: 1/(1 + 1.96²/20)
-    assert quick["settling time, s"].startswith("1.09 [") or quick["settling time, s"].startswith("1.10 [")
-    assert quick["worst 5 %, mm"] == "20.0"
+    assert quick["settled [%]"] == "100.0 [83.9, 100.0]"  # Wilson: 1/(1 + 1.96²/20)
+    assert quick["settling time [s]"].startswith("1.09 [") or quick["settling time [s]"].startswith("1.10 [")
+    assert quick["its worst 5 % [mm]"] == "20.0"
     assert quick["failures"] == "none"
-    assert slow["settled, %"].startswith("80.0 [")
-    assert slow["worst 5 %, mm"] == "∞"
+    assert slow["settled [%]"].startswith("80.0 [")
+    assert slow["its worst 5 % [mm]"] == "∞"
     assert slow["failures"] == "3 not_settled, 1 feature_lost"
 
 
 def test_pairs_are_compared_on_common_seeds(runs):
     (row,) = compare_controllers(runs).to_dict("records")
-    assert row["pair"] == "quick − slow"
-    assert row["lost"] == "0 : 4"
-    assert row["mean difference in settling time, s"].startswith("-1.1")
+    assert row["A − B"] == "quick − slow"
+    assert row["runs lost"] == "0 : 4"
+    assert row["mean difference in settling time [s]"].startswith("-1.1")
     assert row["verdict"] == "better"
-    assert row["P(better)"] == "1.00 [0.84, 1.00]"
+    assert row["P(A better)"] == "1.00 [0.84, 1.00]"
     assert len(list(statistics_tables(runs[runs["controller"] == "quick"]))) == 1
 
 
@@ -85,7 +87,7 @@ def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
     curve["settling_band"] = 0.005
     (row,) = compare_controllers(curve).to_dict("records")
-    assert row["mean difference in RMS of the judged part, mm"] == "-1.50 [-1.50, -1.50]"
+    assert row["mean difference in RMS error of the judged part [mm]"] == "-1.50 [-1.50, -1.50]"
     assert row["verdict"] == "better"
 
 
@@ -93,8 +95,8 @@ def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
     late = runs.assign(settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0))
     few = late[late["seed"] < 8]  # of which the slow one settles in four
     (row,) = compare_controllers(few).to_dict("records")
-    assert row["mean difference in settling time, s"].startswith("28.9")
-    assert (row["lost"], row["P(better)"][:4]) == ("0 : 4", "0.50")
+    assert row["mean difference in settling time [s]"].startswith("28.9")
+    assert (row["runs lost"], row["P(A better)"][:4]) == ("0 : 4", "0.50")
 
 
 def test_an_unknown_metric_is_told_in_one_line(runs):
@@ -141,7 +143,7 @@ os.write(2, b"drawn")
 @pytest.mark.parametrize("room", [60, 80, 100, 200])
 def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypatch, capsys, room):
     named = runs.replace({"controller": {"slow": "rbfnn_mfac:published"}})
-    tables = [("a title", judge_controllers(named)), ("pairs", compare_controllers(named))]
+    tables = [("a title", judge_controllers(named)), ("paired differences", compare_controllers(named))]
     monkeypatch.setattr(terminal, "console", Console(width=room))
     terminal.print_tables(tables, "a legend")
     text = capsys.readouterr().out
@@ -157,7 +159,7 @@ def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypa
 def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys):
     names = [f"a_controller_{i}" for i in range(6)]
     conditions = [("moderate+camera_rotation=60deg", noise, latency) for noise in "014" for latency in ("0", "100")]
-    rows = [dict(zip(("mismatch", "noise", "latency"), key, strict=True)) | dict.fromkeys(names, "100.0")
+    rows = [dict(zip(("mismatch", "noise factor", "latency [ms]"), key, strict=True)) | dict.fromkeys(names, "100.0")
             for key in conditions]  # fmt: skip
     monkeypatch.setattr(terminal, "console", Console(width=80))
     terminal.print_tables([("a title", pd.DataFrame(rows))])
@@ -169,24 +171,24 @@ def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, c
 
 def test_errors_are_shown_in_the_unit_of_the_feature(runs):
     radians = runs.assign(feature_unit="rad")
-    assert judge_controllers(radians)["worst 5 %, rad"].tolist() == ["0.0", "∞"]
+    assert judge_controllers(radians)["its worst 5 % [rad]"].tolist() == ["0.0", "∞"]
 
 
 def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     titles, tables = zip(*summary_tables(runs), strict=True)
     assert titles == tuple(f"{task} on kinematic, moderate" for task in ("exp1", "exp2", "circle"))
-    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "settled", "1.50", "2", "2.0", "3", "130"]
-    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "followed", "–", "–", "2.0", "3", "130"]
+    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "settled", "1.50", "2", "1.0", "3", "130"]
+    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "followed", "2.0", "–", "3", "130"]
 
 
 def test_a_controller_slower_than_the_period_is_marked_and_counted():
     rows = [made_up_row("a", controller="slow", controller_time_overruns=7.0), made_up_row("b", controller="quick")]
     runs = pd.DataFrame(rows)
     ((_, table),) = summary_tables(runs)
-    assert table["step\nµs"].tolist() == ["130*", "130"]
-    assert summary_legend(runs).endswith("; * some steps took longer than the period")
-    assert "period" not in summary_legend(runs.tail(1)).removesuffix("periods; numbers are medians over runs")
+    assert table["step, median [µs]"].tolist() == ["130*", "130"]
+    assert summary_legend(runs).endswith("\n* some steps took longer than the period")
+    assert "*" not in summary_legend(runs.tail(1))
 
 
 def test_the_outcomes_of_several_runs_are_shares():
@@ -201,13 +203,20 @@ def test_an_endless_curve_tells_its_second_lap_and_its_joints():
     laps = {"rms_error_second_lap": 0.003, "max_joint_position_rad": 2.345, "task_kind": "curve"}
     runs = pd.DataFrame([made_up_row("a", task="endurance", settling_time_s=np.nan, outcome="followed", **laps)])
     ((_, table),) = summary_tables(runs)
-    assert table[["RMS lap 2\nmm", "joints\nrad", "RMS end\nmm"]].iloc[0].tolist() == ["3.0", "2.35", "2.0"]
+    second, judged, joints = (
+        "RMS error of the second lap [mm]", "RMS error of the judged part [mm]", "largest joint position [rad]",
+    )  # fmt: skip
+    assert table[[second, judged, joints]].iloc[0].tolist() == ["3.0", "2.0", "2.35"]
+    ((_, short),) = summary_tables(runs.assign(rms_error_second_lap=runs["rms_error_evaluated"]))
+    assert second not in short  # of two laps, the second one is the judged one
+    assert second not in curve_tables(runs.assign(rms_error_second_lap=0.002))["endurance"]["RMS error"]
 
 
 def test_the_legend_tells_the_band_of_the_feature(runs):
     banded = runs.assign(settling_band=0.02)
-    assert outcome_legend([banded]).startswith("settled: came within 20 mm and stayed; followed: ")
-    assert outcome_legend([banded.assign(feature_unit="px", settling_band=2.0)]).endswith("at most 4 px")
+    assert outcome_legend([banded]) == "settled: came within 20 mm and stayed"
+    curve = banded.assign(feature_unit="px", settling_band=2.0, task_kind="curve")
+    assert outcome_legend([curve]) == "followed: RMS error of the judged part at most 4 px"
     assert "within the settling band" in outcome_legend([banded, runs.assign(settling_band=0.005)])
 
 
@@ -215,10 +224,10 @@ def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path)
     runs = results.load_runs(sweep(tmp_path / "out"))
     wanted = runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_s=None)
     (title, table), (second, kinds) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
-    assert second == "random on kinematic: outcomes of the runs, %"
+    assert second == "random on kinematic: outcomes of the runs [%]"
     assert kinds.columns.tolist() == ["controller", "settled", "feature_lost"]
     assert kinds[["settled", "feature_lost"]].values.tolist() == [["72.2", "27.8"], ["72.2", "27.8"], ["76.5", "23.5"]]
-    assert title == "random on kinematic: settled, %"
+    assert title == "random on kinematic: settled [%]"
     assert table.values.tolist() == [
         ["camera_rotation=0deg", "1", "–", "100.0", "100.0", "100.0", "6"],
         ["camera_rotation=30deg", "1", "–", "66.7", "66.7", "66.7", "6"],
@@ -238,13 +247,13 @@ def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
     assert servobench(monkeypatch, "statistics", str(folder), "--json") == 0
     (place,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     quick, slow = place["controllers"]
-    settled = slow["settled, %"]
+    settled = slow["settled [%]"]
     assert (slow["controller"], slow["runs"], settled["value"], settled["count"]) == ("slow", 20, 80.0, 20)
-    assert quick["settled, %"]["low"] == pytest.approx(83.9, abs=0.05)
-    assert slow["worst 5 %, mm"] == "inf"
+    assert quick["settled [%]"]["low"] == pytest.approx(83.9, abs=0.05)
+    assert slow["its worst 5 % [mm]"] == "inf"
     (pair,) = place["pairs"]
-    assert pair["mean difference in settling time, s"]["value"] < -1.0
-    assert (pair["lost"], pair["verdict"], pair["margin"]) == ("0 : 4", "better", "0.05 s")
+    assert pair["mean difference in settling time [s]"]["value"] < -1.0
+    assert (pair["runs lost"], pair["verdict"], pair["margin"]) == ("0 : 4", "better", "0.05 s")
     assert servobench(monkeypatch, "statistics", str(folder), "--json", "--markdown") == 2
 
 
@@ -255,4 +264,4 @@ def test_a_number_that_there_is_not_is_null_for_programs():
 
 def test_times_that_are_not_known_are_a_dash_in_the_summary(tmp_path):
     runs = results.load_runs(sweep(tmp_path / "out")).assign(controller_time_median_us=np.nan)
-    assert [str(table["step\nµs"].iloc[0]) for _, table in summary_tables(runs)] == ["–"] * 3
+    assert [str(table["step, median [µs]"].iloc[0]) for _, table in summary_tables(runs)] == ["–"] * 3
