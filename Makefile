@@ -75,6 +75,7 @@ benchmark: $(VENV)/ready
 
 $(VENV)/ready: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "servobench needs Python 3.11 or newer; name one with make PYTHON=...")'
+	@test -d .package/servobench/plant || { echo "git wrote the links in .package/servobench as text files: clone under Linux, macOS or WSL, or with git -c core.symlinks=true clone"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .

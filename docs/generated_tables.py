@@ -5,6 +5,7 @@
 A generated part of a page is everything between two comments, of which the first says what belongs there:
 
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
+    <!-- settings: circle=harness/run/tasks.py:CurveTask,line=harness/run/tasks.py:LineTask -->
     <!-- metrics: table -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
@@ -13,12 +14,15 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- methods: table -->
     <!-- methods: presets -->
     <!-- options: shared -->
+    <!-- install: report -->
     <!-- end -->
 
 The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
+Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
-stays as it is. `stored` links to a measured table instead of printing it.
+stays as it is. `stored` links to a measured table instead of printing it. `install` shows how to install servobench
+with extras: once a release is on a package index, set `RELEASED` and call `make tables`.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ import operator
 import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +52,11 @@ from servobench.harness.run.metrics import METRICS
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(
-    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options): (\S+) -->\n)(.*?)(<!-- end -->)",
+    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options|install): (\S+) -->\n)(.*?)(<!-- end -->)",
     re.DOTALL,
 )
+RELEASED = False  # whether a release is on a package index, from which all pages then install
+SETTING = ("setting", "default", "unit", "allowed", "meaning")
 
 
 def main() -> None:
@@ -61,17 +68,29 @@ def main() -> None:
 def renewed(page: Path) -> str:
     """Return the text of a page with its generated parts made anew from the code and the stored tables."""
     make = {
-        "settings": lambda part: settings_table(find(part[3])),
+        "settings": lambda part: settings_table(labelled(part[3])),
         "metrics": lambda _: metrics_table(),
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
         "methods": lambda part: presets_table() if part[3] == "presets" else methods_table(),
         "options": lambda _: options_table(),
+        "install": lambda part: install_lines(part[3]),
         "table": lambda part: measured_table(part, page.parent),
         "stored": lambda part: measured_table(part, page.parent),
     }
     text = page.read_text(encoding="utf-8")
     return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
+
+
+def install_lines(extras: str) -> str:
+    """Return the lines that install servobench into a new environment; extras have commas between them, or `plain`."""
+    brackets = "" if extras == "plain" else f"[{extras}]"
+    lines = ["python3 -m venv bench && . bench/bin/activate"]
+    if RELEASED:
+        lines.append(f"pip install 'servobench{brackets}'")
+    else:
+        lines = ["git clone <this repository> servobench", *lines, f"pip install './servobench{brackets}'"]
+    return "\n".join(f"    {line}" for line in lines)
 
 
 def studies_table() -> str:
@@ -161,11 +180,12 @@ def measured_table(part: re.Match[str], folder: Path) -> str:
         return part[4].strip("\n")
     stamp, rows = stored_tables.read(path)
     made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
-    link = f"[commands]({Path(os.path.relpath(path, folder)).as_posix()})"
-    origin = f"`make results ONLY={stamp['study']}`: {made}; {link}"
+    link = Path(os.path.relpath(path, folder)).as_posix()
+    origin = f"`make results ONLY={stamp['study']}`: {made}"
     if part[2] == "stored":
-        return f"All {len(rows)} rows: {origin}"
-    return f"{table(tuple(rows.columns), [tuple(row) for row in rows.itertuples(index=False)])}\n\n{origin}"
+        return f"[All {len(rows)} rows]({link}): {origin}"
+    cells = [tuple(row) for row in rows.itertuples(index=False)]
+    return f"{table(tuple(rows.columns), cells)}\n\n{origin}; [commands]({link})"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
@@ -174,13 +194,31 @@ def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
     return getattr(importlib.import_module("servobench." + path.removesuffix(".py").replace("/", ".")), name)
 
 
-def settings_table(kind: type[Any]) -> str:
-    """Return the table of the settings of a class; settings of a nested section have its name before theirs.
+def labelled(places: str) -> dict[str, type[Any]]:
+    """Return the classes of a marker by label, as of `ukf=PLACE,kalman=PLACE`; a single place may stand alone."""
+    pairs = (each.rpartition("=") for each in places.split(","))
+    return {label: find(place) for label, _, place in pairs}
+
+
+def settings_table(kinds: dict[str, type[Any]]) -> str:
+    """Return the table of the settings of classes by label; those of a nested section have its name before theirs."""
+    owners: dict[tuple[str, ...], list[str]] = {}
+    for label, kind in kinds.items():
+        for row in settings_rows(kind):
+            owners.setdefault(row, []).append(f"`{label}`")
+    if len(kinds) == 1:
+        return table(SETTING, list(owners))
+    names = {row: "all" if len(found) == len(kinds) else ", ".join(found) for row, found in owners.items()}
+    shared_first = sorted(owners, key=lambda row: -len(owners[row]))
+    return table(("setting", "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first])
+
+
+def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the settings of a class.
 
     Raises:
         ValueError: a field has no string below it.
     """
-    rows = []
     default = kind()
     for each in describe_settings(default):
         section = described_elsewhere(default, each.key)
@@ -190,8 +228,7 @@ def settings_table(kind: type[Any]) -> str:
             continue
         if not each.meaning:
             raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
-        rows.append((f"`{each.key}`", toml(each.value), each.unit, each.allowed, each.meaning))
-    return table(("setting", "default", "unit", "allowed", "meaning"), rows)
+        yield (f"`{each.key}`", toml(each.value), each.unit, each.allowed, each.meaning)
 
 
 def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any settings
@@ -204,7 +241,8 @@ def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any set
 def classes_with_tables() -> frozenset[type[Any]]:
     """Return the classes of settings that have a table on some page."""
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    return frozenset(find(place) for _, kind, place, *_ in PART.findall(text) if kind == "settings")
+    parts = (labelled(places) for _, kind, places, *_ in PART.findall(text) if kind == "settings")
+    return frozenset(kind for part in parts for kind in part.values())
 
 
 def metrics_table() -> str:

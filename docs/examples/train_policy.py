@@ -1,6 +1,6 @@
 """Train a policy with Stable-Baselines3 on many robots at once; `learned_policy.py` is the controller that uses it.
 
-    pip install 'servobench[gym]' stable-baselines3
+    pip install stable-baselines3    # and servobench with its extra gym
     python train_policy.py --out policy.npz
     servobench compare --controllers ./learned_policy.py,ukf_mfac --tasks random --seeds 100:120 --out learned
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import tomllib
 import pytest
 from typer.testing import CliRunner
 
+import generated_tables
 from kit import console
 from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
 from kit.foreign_fmu import build_crane
@@ -24,7 +26,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.tasks import TASKS
 
-DEEPER = sorted((ROOT / "docs" / "claims").glob("*.md"))
+GLOSSARY = sorted(anchors(section(read("concepts.md"), "Glossary")))
 PLACES = sorted({match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))})
 
 
@@ -153,9 +155,15 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     done = subprocess.run([*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     index = (tmp_path / "index.html").read_text(encoding="utf-8")
-    places = [page.relative_to(ROOT / "docs").with_suffix(".html").as_posix() for page in (*DOCS, *DEEPER)]
+    places = [page.with_suffix(".html").name for page in (*DOCS, ROOT / "docs" / "worked_example.ipynb")]
     assert [place for place in places if f'href="{place}"' not in index] == ["index.html"]
-    assert index.index(">Limitations<") < index.index(">Five minutes<")
+    shown = re.sub(r"<[^>]*>", "", index[index.index("<article") :].replace("<table", "TABLE <table"))
+    order = ("make run", "servobench run --plant", "TABLE", "Start", "How to", "Reference", "Explanation")
+    places = [shown.index(word) for word in order]
+    assert places == sorted(places)
+    loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]*)"', index)
+    assert loaded
+    assert [place for place in loaded if "//" in place] == []  # it opens without a network
     api = (tmp_path / "api.html").read_text(encoding="utf-8")
     assert all(f'id="servobench.{name}"' in api for name in ("run", "compare", "load", "Controller", "Command"))
 
@@ -170,6 +178,40 @@ def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "ukf_mfac" in printed
     assert "completed" in printed
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/five_minutes.md"])
+def test_words_of_the_field_are_linked_to_the_glossary_where_they_first_appear(name):
+    text = (ROOT / name).read_text(encoding="utf-8")
+    linked = {anchor for anchor in GLOSSARY if f"concepts.md#{anchor})" in text}
+    assert len(GLOSSARY) >= 15
+    assert {"aid", "exp1-to-exp4", "feature", "mismatch", "ukf"} <= linked
+    for anchor in linked:
+        first = re.search(rf"\[`?([^]`]*)`?\]\((?:docs/)?concepts\.md#{anchor}\)", text)
+        before = re.sub(r"^[|#!].*", "", console.FENCED.sub("", text[: first.start()]), flags=re.MULTILINE)
+        assert not re.search(rf"(?<![\w/-]){re.escape(first[1])}(?!\w)", before), f"{first[1]} stands before its link"
+
+
+def test_pages_install_from_the_clone_until_a_release_is_published_and_one_word_switches_them(monkeypatch):
+    pages = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
+    assert [name for name, text in pages.items() if re.search(r"pip install '?servobench", text)] == []
+    shown = {name for name, text in pages.items() if "pip install './servobench" in text}
+    assert shown == {"README.md", "docs/five_minutes.md", "docs/installation.md"}
+    monkeypatch.setattr(generated_tables, "RELEASED", True)
+    renewed = {name: generated_tables.renewed(ROOT / name) for name in pages}
+    assert "    pip install 'servobench'\n" in renewed["README.md"]
+    assert "    pip install 'servobench[report]'\n" in renewed["docs/five_minutes.md"]
+    assert [name for name, text in renewed.items() if "./servobench" in text] == []
+
+
+def test_the_worked_example_is_stored_with_small_outputs_that_come_out_again():
+    notebook = ROOT / "docs" / "worked_example.ipynb"
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")
+    assert notebook.stat().st_size < 200e3
+    command = [sys.executable, str(ROOT / "docs" / "stored_notebook.py"), "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_python_block_is_valid_python():

@@ -45,17 +45,23 @@ def config_classes():
 
 def test_all_settings_have_a_table_and_nothing_else_has():
     text = "".join(page.read_text(encoding="utf-8") for page in generated_tables.PAGES)
-    places = [place for _, kind, place, *_ in generated_tables.PART.findall(text) if kind == "settings"]
-    assert sorted(places) == sorted(
-        f"{kind.__module__.removeprefix('servobench.').replace('.', '/')}.py:{kind.__name__}"
-        for kind in config_classes()
-    )
+    parts = [places for _, kind, places, *_ in generated_tables.PART.findall(text) if kind == "settings"]
+    shown = [kind for places in parts for kind in generated_tables.labelled(places).values()]
+    assert sorted(map(repr, shown)) == sorted(map(repr, config_classes()))
 
 
 def test_a_section_with_a_table_of_its_own_is_not_printed_again():
-    shown = generated_tables.settings_table(registry.find_plant("bullet").config)
+    shown = generated_tables.settings_table({"bullet": registry.find_plant("bullet").config})
     assert "`sensing.latency` | 0.05" in shown  # which differs from the default of the section
     assert "sensing.noise_share" not in shown
+
+
+def test_a_setting_that_several_classes_share_stands_once_and_names_those_that_have_it():
+    laws = {name: LAWS[name].config for name in ("mfac", "pid")}
+    both = generated_tables.settings_table({"one": laws["mfac"], "two": laws["mfac"], "three": laws["pid"]})
+    assert both.count("| `gain` | `one`, `two` | ") == 1
+    assert both.count("| `proportional_gain` | `three` | ") == 1
+    assert generated_tables.settings_table({"a": laws["pid"], "b": laws["pid"]}).count(" | all | ") == 5
 
 
 @pytest.mark.parametrize("page", generated_tables.PAGES, ids=lambda page: page.name)
@@ -167,10 +173,12 @@ def test_the_profiles_have_the_magnitudes_of_the_code():
 
 
 def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
-    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "axis")
-    assert {names(row[0])[0] for row in rows} == set(AXES)
-    for name, example, _ in rows:
-        assert Mismatch.parse(names(example)[0]).size(names(name)[0]) > 0.0
+    found = tables(read("plants.md"))
+    axes = [names(row[1])[0] for _, header, rows in found if header[0] == "axis" for row in rows]
+    words = [names(row[0])[0] for _, header, rows in found if header[0] == "word" for row in rows if names(row[0])]
+    assert {example.partition("=")[0] for example in (*axes, *words)} == set(AXES)
+    for example in (*axes, *words):
+        assert Mismatch.parse(example).size(example.partition("=")[0]) > 0.0
 
 
 def test_the_keys_of_a_mapping_are_those_of_the_code():

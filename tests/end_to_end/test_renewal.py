@@ -75,7 +75,7 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     page.write_text(shown)
     assert generated_tables.renewed(page) == shown
     page.write_text("<!-- stored: counts -->\nold\n<!-- end -->\n")
-    assert "All 1 rows: `make results ONLY=toy`: commit" in generated_tables.renewed(page)
+    assert "[All 1 rows](tables/counts.csv): `make results ONLY=toy`: commit" in generated_tables.renewed(page)
 
 
 def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(toy, monkeypatch):
