@@ -1,7 +1,7 @@
 """Decisions and faults of recorded code: C takes one of two ways, as the code did, and reports a fault by its code.
 
 Decisions are those of `plant.contract.lanes`. Numpy code raises where its numbers are of no use. A recorded step cannot
-be left in its middle: it goes on, and returns a code of `MESSAGES` beside its results, 0 for none. Functions that are
+be left in its middle: it goes on, and returns the code of a fault beside its results, 0 for none. Functions that are
 recorded on their own, such as the ways of a branch, collect their faults in a frame each.
 """
 
@@ -20,12 +20,8 @@ from servobench.fmus.trace.arrays import Expression, NotTraceable, Traced, as_tr
 from servobench.plant.contract.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
-NOT_FINITE: Final = 1
-NOT_DEFINITE: Final = 2
-MESSAGES: Final = {
-    NOT_FINITE: "the estimate or the command is not finite",
-    NOT_DEFINITE: "a covariance is not positive definite",
-}
+NOT_FINITE: Final = 1  # code of a fault: the estimate or the command is not finite
+NOT_DEFINITE: Final = 2  # likewise: a covariance is not positive definite
 _NUMBERS = count()
 
 

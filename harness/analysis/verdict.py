@@ -32,7 +32,6 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
-LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
 BETTER: Final = "faster or more precise"
