@@ -78,8 +78,7 @@ def leaves_of(tree: Any) -> list[Any]:  # noqa: ANN401 - any tree
 def with_leaves(tree: Tree, leaves: list[Any]) -> Tree:
     """Return a tree of the same form with other arrays."""
     rest = iter(leaves)
-    renewed: Tree = map_arrays(lambda _: next(rest), tree)
-    return renewed
+    return map_arrays(lambda _: next(rest), tree)
 
 
 def symbols_like(leaves: list[Any]) -> list[Traced]:
@@ -135,8 +134,7 @@ def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *ar
         branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
         for lane in np.ndindex(chosen.shape)
     ]
-    stacked: Tree = map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
-    return stacked
+    return map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
 
 
 def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:
