@@ -10,14 +10,13 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 
 from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.harness.check.report import CheckFailed, at
 from servobench.harness.config.source import is_users, show
 from servobench.harness.run.contract import HeldController
 from servobench.harness.run.loop import LoopSettings, begin, periods
@@ -144,7 +143,7 @@ class Driver:
     def __init__(self, controller: Controller, rig: Rig, seed: int = 0) -> None:
         """Take controller, rig, and the seed of the noise, which `reset` gets, too."""
         self.controller, self.rig, self.seed = controller, rig, seed
-        self._watched = _Watched(controller, rig.spec)
+        self._held = HeldController(controller, rig.spec)
         self.times: list[float] = []  # [s] of each step
 
     def begin(self) -> Driver:
@@ -153,47 +152,20 @@ class Driver:
         desired = conditions.scale * np.tile(goal, (MAX_PERIODS + conditions.preview, 1))
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)
-        self.rollout = begin(self.rig, self._watched, desired, length, (self.seed, self.seed))
+        self.rollout = begin(self.rig, self._held, desired, length, (self.seed, self.seed))
         return self
 
     def run(self, count: int) -> FloatArray:
         """Return the commands (count, n) [rad/s] of the next periods.
 
         Raises:
-            CheckFailed: `step` changed its arguments.
-            WrongAnswer: it returned no command of n finite numbers.
+            WrongAnswer: `step` returned no command of n finite numbers, or changed its arguments.
         """
         commands = []
-        for period in islice(periods(self.rollout, self._watched), count):
+        for period in islice(periods(self.rollout, self._held), count):
             self.times.append(1e-9 * period.nanoseconds[0])
             commands.append(period.command.joint_velocity)
         return np.array(commands)
-
-
-@final
-class _Watched(Controller):
-    """A controller whose answers are checked, and whose steps must leave their arguments as they are."""
-
-    def __init__(self, controller: Controller, spec: PlantSpec) -> None:
-        self._controller, self._held = controller, HeldController(controller, spec)
-
-    def reset(self, observation: Observation, seed: int) -> None:
-        """See `Controller.reset`."""
-        self._held.reset(observation, seed)
-
-    def step(self, observation: Observation, reference: FloatArray) -> Command:
-        """See `Controller.step`."""
-        reference = reference.copy()  # whose flag a controller can set, as that of any array of its own
-        reference.flags.writeable = False
-        given = _bytes(observation, reference)
-        command = self._held.step(observation, reference)
-        if _bytes(observation, reference) != given:
-            raise CheckFailed(f"{at(self._controller.step)}: step changes its arguments; work on a copy")
-        return command
-
-
-def _bytes(observation: Observation, reference: FloatArray) -> tuple[bytes, ...]:
-    return observation.joint_position.tobytes(), observation.feature.tobytes(), reference.tobytes()
 
 
 @dataclass

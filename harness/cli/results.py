@@ -58,6 +58,7 @@ def statistics(
         say(missing)
     tables = statistics_tables(runs, metric)
     print_markdown(tables) if markdown else print_tables(tables)
+    say_aids(folder)
 
 
 def report(
@@ -134,6 +135,14 @@ def export(
         say(missing)
     files = export_folder(folder, out, format_)
     say(f"{len(files)} files in {out}")
+
+
+def say_aids(folder: Path) -> None:
+    """Print which controllers of a folder have the aids, where it has several."""
+    from servobench.harness.analysis.folder import describe_controllers
+
+    if line := describe_controllers(folder):
+        say(line)
 
 
 def print_faults(runs: pd.DataFrame) -> None:

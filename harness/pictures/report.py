@@ -33,7 +33,7 @@ from servobench.harness.analysis.comparison import (
     split_tasks,
     texts_of,
 )
-from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, other_tables
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
@@ -167,6 +167,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         verdict=judge(runs),
         leaders=leaders(runs),
         scope=_scope(runs, facts),
+        aids=describe_controllers(folder),
         band=settling_band(runs),
         following=settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,

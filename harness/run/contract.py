@@ -1,5 +1,6 @@
 """Controllers and plants of third parties, held to their contracts: each answer of a method is checked first.
 
+They get copies, and copies of their answers are kept, so that code that writes into its arrays changes no row of a log.
 Without this a step that returns an array ends in an attribute error of the loop, far from the line that is wrong. The
 controllers and plants that this package composes itself are not checked, so that they cost nothing.
 """
@@ -12,15 +13,17 @@ from typing import Any, Final, final
 
 import numpy as np
 
+from servobench.controllers.aided import AidedController
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import ServoController
 from servobench.harness.run.result import WrongAnswer
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
-from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.checks import REAL, FloatArray
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
 
 PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
+MAX_NAMES: Final = 256  # of diagnostics in a run: each is a column
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
@@ -35,27 +38,33 @@ class HeldController(Controller):
     """A controller whose answers are checked."""
 
     def __init__(self, controller: Controller, spec: PlantSpec) -> None:
-        """Take a controller and the spec of its plant."""
+        """Take a controller and the spec of its plant; with aids it is the user's controller that is checked, too."""
+        if isinstance(controller, AidedController):
+            controller.law.own = HeldController(controller.law.own, spec)
         self._controller, self._spec = controller, spec
+        self._names: set[str] = set()
 
     def reset(self, observation: Observation, seed: int) -> None:
         """See `Controller.reset`."""
         method = self._controller.reset
-        given = _call(method, "reset(self, observation, seed)", observation, seed)
+        given = _call(method, "reset(self, observation, seed)", _copied(observation), seed)
         if given is not None:
             raise WrongAnswer(f"reset must return nothing, got {_kind(given)}; keep it in self", method)
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`."""
         method, n = self._controller.step, self._spec.n
-        command = _call(method, "step(self, observation, reference)", observation, reference)
+        given = _copied(observation), _frozen(reference)
+        command = _call(method, "step(self, observation, reference)", *given)
+        if _bytes(*given) != _bytes(observation, reference):
+            raise WrongAnswer("step changes its arguments; work on a copy", method)
         if not isinstance(command, Command):
             text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
             raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
         if command.joint_velocity.shape != (n,):
             shape = command.joint_velocity.shape
             raise WrongAnswer(f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}", method)
-        return command
+        return Command(command.joint_velocity)
 
     def diagnostics(self) -> Diagnostics:
         """See `Controller.diagnostics`."""
@@ -69,6 +78,10 @@ class HeldController(Controller):
                 raise WrongAnswer(f"diagnostics must hold numbers, got {name!r}: {_kind(value)}", method)
             if not isinstance(name, str):
                 raise WrongAnswer(f"diagnostics must have texts as names, got {name!r}", method)
+        self._names.update(given)
+        if len(self._names) > MAX_NAMES:
+            text = f"diagnostics must keep to the same names, at most {MAX_NAMES}: each is a column; got"
+            raise WrongAnswer(f"{text} {len(self._names)}, among them {list(given)[-1]!r}", method)
         return given
 
     def estimated_jacobian(self) -> FloatArray | None:
@@ -78,6 +91,8 @@ class HeldController(Controller):
         if estimate is not None and (not isinstance(estimate, np.ndarray) or estimate.shape != wanted):
             text = f"estimated_jacobian must return an array of shape {wanted} or None"
             raise WrongAnswer(f"{text}, got {_kind(estimate)}", method)
+        if estimate is not None and estimate.dtype.kind not in REAL:
+            raise WrongAnswer(f"estimated_jacobian must hold real numbers, got {estimate.dtype}", method)
         return None if estimate is None else np.asarray(estimate)
 
 
@@ -107,7 +122,10 @@ class HeldPlant(Plant):
             value = getattr(truth, name)
             if value is not None and np.shape(value) != shape:
                 raise WrongAnswer(f"truth of the plant: {name} must have shape {shape}, got {np.shape(value)}", method)
-        return truth
+            if value is not None and np.asarray(value).dtype.kind not in REAL:
+                text = f"truth of the plant: {name} must hold real numbers, got {np.asarray(value).dtype}"
+                raise WrongAnswer(text, method)
+        return Truth(_frozen(truth.feature), None if truth.jacobian is None else _frozen(truth.jacobian))
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -126,7 +144,25 @@ class HeldPlant(Plant):
             shape = getattr(observation, what).shape
             if shape != (size,):
                 raise WrongAnswer(f"{name} of the plant: {what} must have shape ({size},), got {shape}", method)
-        return observation
+        return _copied(observation)
+
+
+def _copied(observation: Observation) -> Observation:
+    """Return an observation whose arrays are its own."""
+    joints, feature, valid = map(_frozen, (observation.joint_position, observation.feature, observation.valid))
+    return trusted_observation(observation.time, joints, feature, observation.feature_valid, valid)
+
+
+def _bytes(observation: Observation, reference: FloatArray) -> tuple[float | bytes, ...]:
+    arrays = observation.joint_position, observation.feature, observation.valid, reference
+    return observation.time, *(array.tobytes() for array in arrays)
+
+
+def _frozen(array: Any) -> Any:  # noqa: ANN401 - an array of any kind
+    """Return a read-only copy."""
+    copy = np.array(array)
+    copy.flags.writeable = False
+    return copy
 
 
 def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - any answer

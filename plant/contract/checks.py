@@ -8,12 +8,27 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+REAL = "fiub"  # kinds of arrays, as numpy names them
 
 
 def is_finite(array: FloatArray) -> bool:
     """Return whether no entry is infinite or NaN; the sum of squares is tried first, at a third of the cost."""
     flat = array.reshape(-1)
     return math.isfinite(flat.dot(flat)) or bool(np.isfinite(array).all())
+
+
+def real_numbers(name: str, value: npt.ArrayLike) -> FloatArray:
+    """Return a float64 copy of numbers.
+
+    Raises:
+        ValueError: texts, objects or complex numbers, or a mask that would be lost.
+    """
+    given = np.asanyarray(value)
+    if given.dtype.kind not in REAL:
+        raise ValueError(f"{name} must be real numbers, got {given.dtype}")
+    if np.ma.isMaskedArray(given) and np.ma.is_masked(given):
+        raise ValueError(f"{name} must be numbers, got a masked array; write .filled(value)")
+    return np.array(given, dtype=np.float64)
 
 
 def as_array(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
@@ -25,9 +40,9 @@ def as_array(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatAr
         shape: wanted shape.
 
     Raises:
-        ValueError: wrong shape, or an entry that is not finite.
+        ValueError: wrong shape, or an entry that is no finite number.
     """
-    array = np.array(value, dtype=np.float64)
+    array = real_numbers(name, value)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not is_finite(array):

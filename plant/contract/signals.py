@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_vector, is_finite
+from servobench.plant.contract.checks import FloatArray, as_vector, is_finite, real_numbers
 
 BoolArray = npt.NDArray[np.bool_]
 SETTLING_BAND = 0.005  # share of a feature's natural size: 5 mm on the UR5
@@ -203,9 +203,7 @@ class Command:
 
     def __post_init__(self) -> None:
         """Check that everything is finite and freeze the array."""
-        if isinstance(self.joint_velocity, np.ndarray) and self.joint_velocity.dtype.kind == "c":
-            raise ValueError(f"joint_velocity must be real, got {self.joint_velocity.dtype}")
-        value = np.array(self.joint_velocity, dtype=np.float64)
+        value = real_numbers("joint_velocity", self.joint_velocity)
         if value.ndim == 0:
             raise ValueError(f"joint_velocity must have shape (n,), got {value}")
         if not is_finite(value):

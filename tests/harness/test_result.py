@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import servobench
+from kit.command import judged
 from kit.resting import Resting
-from servobench.controllers.controller import Controller
+from kit.toy_plants import Plain
+from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.harness.batch import results
 from servobench.harness.config.source import PACKAGE_FOLDER
+from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.result import Ending, RunResult, log_entry
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import FilterDiverged, RunFault
 from servobench.plant.contract.signals import Command
 
@@ -218,6 +224,17 @@ TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in ra
             "np.zeros((6, 3))",
             "estimated_jacobian must return an array of shape (3, 6) or None, got ndarray of shape (6, 3)",
         ),
+        (
+            "estimated_jacobian(self)",
+            "np.full((3, 6), object())",
+            "estimated_jacobian must hold real numbers, got object",
+        ),
+        (
+            LOOK,
+            "{f'{name}': 1.0 for name in range(257)}",
+            "diagnostics must keep to the same names, at most 256: each is a column; got 257, among them '256'",
+        ),
+        (STEP, "object.__setattr__(observation, 'time', 7.0)", "step changes its arguments; work on a copy"),
     ],
 )
 def test_a_wrong_answer_is_told_with_what_to_write_instead(method, answer, words):
@@ -226,6 +243,46 @@ def test_a_wrong_answer_is_told_with_what_to_write_instead(method, answer, words
     name = method.partition("(")[0]
     assert result.row["reason"] == f"WrongAnswer: {words} (wrong.py:3 in Wrong.{name})"
     assert 'elsewhere/wrong.py", line 3, in' in result.trace
+
+
+class Writing(Resting):
+    """Writes, past every flag, into arrays that it got or gave, once their period is over."""
+
+    def step(self, observation, reference):
+        command = super().step(observation, reference)
+        self.kept = [observation.joint_position, observation.feature, observation.valid, reference]
+        self.kept += [command.joint_velocity]
+        return command
+
+    def diagnostics(self):
+        for array in self.kept:
+            ctypes.memset(array.ctypes.data, 1, array.nbytes)
+        return {}
+
+
+def test_a_controller_that_writes_into_its_arrays_changes_no_row_of_the_log():
+    alone, written = (servobench.run(kind, task="exp2", settings=SHORT) for kind in (Resting, Writing))
+    assert written.row["status"] == "completed"
+    pd.testing.assert_frame_equal(*(judged(each.steps.drop(columns="run_id")) for each in (alone, written)))
+
+
+class Reusing(Plain):
+    """A plant that uses the same array for the truth of all instants."""
+
+    def truth(self):
+        self.seen_last = getattr(self, "seen_last", np.zeros(2))
+        self.seen_last[:] = self.q
+        return servobench.Truth(self.seen_last, np.eye(2))
+
+
+def test_a_plant_may_use_the_array_of_its_truth_again():
+    setup = PlantSetup(None, None, 0.1)
+    plant, _ = held_to_contract(Reusing(setup), Resting(RobotKnowledge(Plain(setup).spec, 0)))
+    plant.reset(0)
+    truth = plant.truth()
+    plant.step(Command(np.ones(2)))
+    assert plant.truth().feature.tolist() == [0.4, 0.30000000000000004]
+    assert truth.feature.tolist() == [0.3, 0.2]
 
 
 @pytest.mark.parametrize("answer", ["{'a': 1}", "{'a': True}", "{'a': np.float32(2.0)}", "{'a': np.array(2.0)}", "{}"])
