@@ -64,6 +64,7 @@ PART = re.compile(
 )
 RELEASED = False  # whether a release is on a package index, from which all pages then install
 NEW_LINE = "\n"
+LINE = 120  # letters
 SETTING = ("setting", "default", "unit", "allowed", "meaning")
 
 
@@ -320,8 +321,18 @@ def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
     """Return the line, or lines, that begin the definition of a function or a class."""
     if isinstance(thing, type):
         return f"class {thing.__name__}:"
-    line = f"def {thing.__name__}{unquoted(str(inspect.signature(thing)))}:"
-    return "\n".join(textwrap.wrap(line, 110, subsequent_indent=" " * 8, break_on_hyphens=False))
+    found = inspect.signature(thing)
+    line = f"def {thing.__name__}{unquoted(str(found))}:"
+    if len(line) <= LINE:
+        return line
+    end = line[line.rindex(") -> ") :]
+    arguments = [unquoted(str(each)) for each in found.parameters.values()]
+    by_name = [each.kind is each.KEYWORD_ONLY for each in found.parameters.values()]
+    if any(by_name):
+        arguments.insert(by_name.index(True), "*")
+    together = f"    {', '.join(arguments)}"
+    lines = [together] if len(together) <= LINE else [f"    {each}," for each in arguments]
+    return "\n".join([f"def {thing.__name__}(", *lines, end])
 
 
 def unquoted(signature: str) -> str:
