@@ -31,7 +31,7 @@ COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a 
 BASH: Final = "complete_bash"
 WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
-    "First steps": (runs.run, runs.compare, results.statistics, results.report, record),
+    "First steps": (runs.run, runs.compare, results.statistics, results.report, results.figures, record),
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
     "Studies": (studies.sweep, analyse, studies.robustness, studies.suite, studies.claims, studies.tune),

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ def statistics(
         ),
     ] = None,
     markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
+    latex: Annotated[
+        bool, named_option("--latex", "", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Judge the controllers of a folder, with intervals.
@@ -41,8 +45,8 @@ def statistics(
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
-    if markdown and as_json:
-        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+    if markdown + latex + as_json > 1:
+        raise ConfigurationError("--markdown, --latex and --json are ways to print the same; give one of them")
     runs = results.load_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
@@ -55,8 +59,13 @@ def statistics(
         )
         return
     if missing:
-        say(missing)
+        say(f"% {missing}" if latex else missing)
     tables = statistics_tables(runs, metric)
+    if latex:
+        from servobench.harness.analysis.paper import latex_tables, methods_paragraph
+
+        say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
+        return
     print_markdown(tables) if markdown else print_tables(tables)
     say_aids(folder)
 
@@ -70,6 +79,51 @@ def report(
     With figures, sortable tables and paths to turn; it needs no network.
     """
     make_report(folder, out)
+
+
+def figures(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
+    kind: Annotated[str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")] = "all",
+    controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
+    names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
+    width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 3.5in, 89mm or 252pt.")] = "7.2in",
+    title: Annotated[bool, named_option("--title/--no-title", "", "Write what it shows above each figure.")] = True,
+    format_: Annotated[
+        str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")
+    ] = "pdf",
+    out: Annotated[Path | None, option("FOLDER", "Folder of the figures; default: figures in the folder.")] = None,
+) -> None:
+    """Draw figures of a folder for a paper.
+
+    They are those of the report, with chosen kinds, controllers, names and width; nothing is simulated for them.
+    """
+    from servobench.harness.batch import results
+    from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
+    from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
+
+    formats = selection.split_names("format", format_, ALL_FORMATS, selection.among("format", ALL_FORMATS))
+    kinds = selection.split_names("kind", kind, tuple(KINDS), selection.among("kind", tuple(KINDS)))
+    known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
+    shown = selection.split_names("controllers", controllers, known, selection.among("controllers", known))
+    own = [name.strip() for name in names.split(",")] if names else shown
+    if len(own) != len(shown):
+        raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
+    if "pgf" in formats:
+        check_tex()
+    if missing := results.describe_missing(folder):
+        say(missing)
+    choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
+    target = out or folder / FOLDER
+    with console.status("drawing the figures"), writing(target):
+        files = [
+            path
+            for named in folder_figures(folder, choice)
+            for path in save_figure(named.figure, target / named.stem, formats, exact_width=True)
+        ]
+    if not files:
+        kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
+        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+    say("\n".join(map(str, files)))
 
 
 def make_report(folder: Path, out: Path | None = None) -> None:

@@ -187,13 +187,17 @@ def tune(
         str, option(CONTROLLER.several(), "Comma-separated names, or all that have a search space.")
     ] = "all",
     studies: Annotated[
-        int, option("COUNT", "Studies of each method; the one that is best on a second set of robots is taken.")
+        int,
+        option(
+            "COUNT",
+            "Studies of each method; their results and the values in use meet on a second set of robots.",
+        ),
     ] = 3,
     trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
         int, option("COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 12,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[
