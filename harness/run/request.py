@@ -66,7 +66,7 @@ class RunSettings:
     """[s] control period"""
     preview_time: NonNegative = 0.5
     """[s] of the future reference that every controller gets, rounded up to control periods"""
-    lost_after: Positive = 1.0
+    lost_after: Annotated[Positive, Usual(20.0)] = 1.0
     """[s] without a valid feature after which a run ends"""
     camera_moves_at: ShareBelowOne = 0.5
     """share of the run after which a mismatch's `camera_move` happens"""
