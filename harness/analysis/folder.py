@@ -10,6 +10,7 @@ import pandas as pd
 from pyarrow import ArrowException
 
 from servobench.harness.batch import results
+from servobench.harness.batch.tables import read_tables
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
@@ -75,7 +76,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         if own or path.suffix not in (".parquet", ".csv"):
             continue
         try:
-            table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+            table = pd.read_csv(path) if path.suffix == ".csv" else read_tables(folder, [path.name])
         except (OSError, ValueError, ArrowException, OverflowError) as error:
             why = " ".join(str(error).split())
             raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
