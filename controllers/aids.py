@@ -116,3 +116,13 @@ RANGES: Final[Mapping[str, Tuned]] = _marked(Tuned)
 """The numbers of the aids that are tuned, by name."""
 EQUIPPED: Final[Mapping[str, Any]] = {name: switch.equipped for name, switch in SWITCHES.items()}
 """The value of each aid in a best equipped method."""
+
+
+def describe_aids(values: Mapping[str, Any]) -> str:
+    """Return which aids a controller has by its settings, whose keys have dots: with all, without, with some."""
+    none = AidsConfig()
+    on = [name for name in SWITCHES if values.get(f"aids.{name}", getattr(none, name)) != getattr(none, name)]
+    off = [name for name in SWITCHES if name not in on]
+    if len(on) < len(off):
+        return f"with the aids {', '.join(on)} alone" if on else "without aids"
+    return f"with all aids{' but ' * bool(off)}{', '.join(off)}"

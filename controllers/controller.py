@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -99,7 +99,15 @@ class RobotKnowledge:
 
 
 class Controller(ABC):
-    """A discrete-time controller: one observation and the reference in, one command out."""
+    """A discrete-time controller: one observation and the reference in, one command out.
+
+    Attributes:
+        aids: `servobench.EQUIPPED` in a class of your own gives it the aids of the methods of the bench; None for none.
+        in_model_frame: whether it was trained on the nominal model, so that with aids it works in that model's frame.
+    """
+
+    aids: ClassVar[Mapping[str, Any] | None] = None
+    in_model_frame: ClassVar[bool] = False
 
     @abstractmethod
     def reset(self, observation: Observation, seed: int) -> None:

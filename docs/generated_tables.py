@@ -9,7 +9,7 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- metrics: table -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
-    <!-- stored: dynamics -->
+    <!-- stored: dynamics,dynamics_circle -->
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
     <!-- methods: presets -->
@@ -21,7 +21,7 @@ The meaning of a setting is the string below its field, what is allowed is its t
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
-stays as it is. `stored` links to a measured table instead of printing it. `install` shows how to install servobench
+stays as it is. `stored` links to measured tables of a study instead. `install` shows how to install servobench
 with extras: once a release is on a package index, set `RELEASED` and call `make tables`.
 """
 
@@ -76,7 +76,7 @@ def renewed(page: Path) -> str:
         "options": lambda _: options_table(),
         "install": lambda part: install_lines(part[3]),
         "table": lambda part: measured_table(part, page.parent),
-        "stored": lambda part: measured_table(part, page.parent),
+        "stored": lambda part: stored_links(part, page.parent),
     }
     text = page.read_text(encoding="utf-8")
     return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
@@ -169,7 +169,7 @@ def aids_in_words(aids: AidsConfig) -> str:
 
 
 def measured_table(part: re.Match[str], folder: Path) -> str:
-    """Return a table of docs/tables or its number of rows, and how it was made; the part as it is before its study.
+    """Return a table of docs/tables and how it was made; the part as it is before its study.
 
     Args:
         part: of the page, which names the table.
@@ -178,14 +178,26 @@ def measured_table(part: re.Match[str], folder: Path) -> str:
     path = stored_tables.FOLDER / f"{part[3]}.csv"
     if not path.exists():
         return part[4].strip("\n")
-    stamp, rows = stored_tables.read(path)
-    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
-    link = Path(os.path.relpath(path, folder)).as_posix()
-    origin = f"`make results ONLY={stamp['study']}`: {made}"
-    if part[2] == "stored":
-        return f"[All {len(rows)} rows]({link}): {origin}"
+    rows = stored_tables.read(path).table
     cells = [tuple(row) for row in rows.itertuples(index=False)]
-    return f"{table(tuple(rows.columns), cells)}\n\n{origin}; [commands]({link})"
+    link = Path(os.path.relpath(path, folder)).as_posix()
+    return f"{table(tuple(rows.columns), cells)}\n\n{origin(path)}; [commands]({link})"
+
+
+def stored_links(part: re.Match[str], folder: Path) -> str:
+    """Return links to tables of docs/tables, and how they were made; see `measured_table`."""
+    paths = [stored_tables.FOLDER / f"{name}.csv" for name in part[3].split(",")]
+    if not all(path.exists() for path in paths):
+        return part[4].strip("\n")
+    links = [f"[`{path.stem}`]({Path(os.path.relpath(path, folder)).as_posix()})" for path in paths]
+    return f"All rows: {', '.join(links)} ({origin(paths[0])})"
+
+
+def origin(path: Path) -> str:
+    """Return how a table was made."""
+    stamp = stored_tables.read(path).stamp
+    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
+    return f"`make results ONLY={stamp['study']}`: {made}"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name

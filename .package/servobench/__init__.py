@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from servobench.controllers.aids import EQUIPPED
     from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 __all__ = [
+    "EQUIPPED",
     "Command",
     "Controller",
     "ControllerEntry",
@@ -46,6 +48,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "servobench.controllers.aids": ("EQUIPPED",),
     "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
+from typing import Generic, Literal, TypeAlias, TypeVar
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
@@ -39,7 +39,7 @@ class Law(ABC, Generic[State]):
     """
 
     owns: frozenset[Stage] = frozenset()
-    in_model_frame: ClassVar[bool] = False
+    in_model_frame: bool = False
 
     @abstractmethod
     def start(self, observation: Observation) -> State:

@@ -86,7 +86,7 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by their names
     """Return a table whose columns are pairs (group, heading)."""
     table = pd.DataFrame(rows)
-    return table if table.empty else table.set_axis(pd.MultiIndex.from_tuples(table.columns), axis=1)
+    return table if table.empty else table.set_axis(pd.MultiIndex.from_tuples(map(tuple, table.columns)), axis=1)
 
 
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
@@ -156,7 +156,7 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
     """Return whether a metric repeats another one: these runs have no second lap, or it is the judged part."""
     judged, second = column_of(runs, "rms_error_evaluated"), column_of(runs, SECOND_LAP)
-    return name == SECOND_LAP and (second.isna().all() or second.equals(judged.rename(SECOND_LAP)))
+    return name == SECOND_LAP and (second.isna() | (second == judged)).all().item()
 
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:

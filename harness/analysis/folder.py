@@ -9,8 +9,10 @@ from typing import Any, Final
 import pandas as pd
 from pyarrow import ArrowException
 
+from servobench.controllers.aids import describe_aids
 from servobench.harness.batch import results
 from servobench.harness.batch.tables import read_tables
+from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.faults import ConfigurationError
@@ -46,6 +48,22 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
         "seeds": _seeds(runs["seed"].tolist()),
         "made": f"{made}, Python {manifest.get('python', 'unknown')}",
     }
+
+
+def describe_controllers(folder: Path) -> str:
+    """Return one line that says which of several controllers have the aids, by their settings; empty for a single one.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    manifest = results.read_manifest(folder)
+    names, configuration = manifest.get("controllers", ()), manifest.get("configuration", {})
+    found: dict[str, list[str]] = {}
+    for name in names if len(names) > 1 else ():
+        values = configuration.get(name)
+        known = values is not None and not name.startswith(MAPPED)
+        found.setdefault(describe_aids(values) if known else "aids unknown", []).append(name)
+    return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
 
 
 def describe_settings(folder: Path) -> dict[str, str]:

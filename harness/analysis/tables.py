@@ -157,10 +157,11 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
 
 def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     pairs = list(combinations(dict.fromkeys(runs["controller"]), 2))
-    if not pairs:
+    if not pairs and metric is None:
         return []
-    if metric is None:
-        metric = judged_metric(runs)
+    if not pairs:
+        raise ConfigurationError(f"--metric {metric} is that by which pairs of controllers are compared; there is one")
+    metric = judged_metric(runs) if metric is None else metric
     numbers = [str(name) for name in runs.select_dtypes("number").columns]
     if metric not in numbers:
         raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")

@@ -68,7 +68,8 @@ def sums_of(folder: Path) -> Sums | None:
     try:
         return read_sums(folder)
     except OSError as error:
-        raise ConfigurationError(f"{folder / SUMS} cannot be read: {error.strerror}") from error
+        wrong = f"{folder / SUMS} cannot be read: {error.strerror}"
+        raise ConfigurationError(wrong if folder.is_dir() else f"{folder} is not a results folder") from error
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
+from servobench.controllers.aided import with_aids
+from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws
 from servobench.harness.config.registry import choose_controller, find_controller, offering
-from servobench.harness.config.settings import default_config
+from servobench.harness.config.settings import default_config, flatten
+from servobench.harness.config.source import describe_at
 from servobench.harness.run.contract import HeldController
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.signals import Observation, trusted_observation
 
 JOINTS, FEATURES = 6, 3
 OTHER_SIZES: Final = (7, 2)
@@ -27,6 +32,8 @@ SLOW: Final = 0.02  # [s] a step, beyond which runs are short
 LIMIT_TOLERANCE: Final = 1e-9
 APPROACH: Final = 60  # [periods] after which the error should have become smaller
 ROUGH: Final = (1e-3, 1e3, 1e6)  # scales of features
+ONE_BY_ONE: Final = "its runs go one by one; those of a Law and an Estimator in a Servo may advance together"
+IN_LANES: Final = "its parts must be pure and take arrays with leading axes, see servobench/plant/contract/lanes.py"
 SEED_REMEDY: Final = "make one in reset: self.rng = np.random.default_rng(seed)"
 
 
@@ -88,6 +95,8 @@ class ControllerChecks:
             Check("approach", self.approach, ("command",)),
             Check("time", self.time, ("command",)),
             Check("output", self.output, ("command",)),
+            Check("aids", self.aids, ("command",)),
+            Check("side by side", self.side_by_side, ("command",)),
         ]
 
     def constructor(self) -> None:
@@ -262,6 +271,36 @@ class ControllerChecks:
             return None
         return f"it prints {lines} lines in {self.steps} steps; numbers for the log are returned by diagnostics"
 
+    def aids(self) -> str | None:
+        """It has the aids of the others, or could have them."""
+        entry, values = self.entry, flatten(default_config(self.entry))
+        words = describe_aids(values)
+        if not words.startswith("without"):
+            return None if words == "with all aids" else words
+        if "aids.delay" in values or not isinstance(getattr(entry.build, "make", None), type):
+            return f"{words}; those of a Servo are its argument `aids`, and settings of the same name"
+        try:
+            ControllerChecks(with_aids(entry, EQUIPPED)).command()
+        except Exception as error:  # noqa: BLE001 - of the user
+            return f"{words}, and it cannot have them as it is: {describe_at(error)}; reference has row 0 alone there"
+        return f"{words}; `aids = servobench.EQUIPPED` in the class gives it those of the others"
+
+    def side_by_side(self) -> str | None:
+        """Runs that advance together have the commands of each alone, to the bit."""
+        if not self.entry.side_by_side:
+            return ONE_BY_ONE
+        servo, state = getattr(self._build()[0], "servo", None), cast(ServoState | None, None)
+        if not isinstance(servo, Servo):
+            raise CheckFailed("its entry says side_by_side=True, so that build must return a ServoController")
+        alone = [self._driver(seed, lost=range(2, 2 + 2 * seed)).begin() for seed in range(2)]
+        for _ in range(self.steps):
+            given = [(each.rollout.observation, each.rollout.reference) for each in alone]
+            seen, reference = _together([one for one, _ in given]), np.stack([one for _, one in given])
+            state, u = servo.step(state or servo.start(seen), seen, reference)
+            if not np.array_equal(u, np.concatenate([each.run(1) for each in alone])):
+                raise CheckFailed(f"two runs that advance together have other commands than each alone; {IN_LANES}")
+        return None
+
     def _build(self, preview: int | None = None) -> tuple[Controller, Rig]:
         rig = Rig(JOINTS, FEATURES)
         knowledge = rig.knowledge(truth=self.entry.needs_truth)
@@ -274,3 +313,8 @@ class ControllerChecks:
         controller, rig = self._build(chosen.preview)
         rig.conditions = chosen
         return Driver(controller, rig, seed)
+
+
+def _together(seen: Sequence[Observation]) -> Observation:
+    names = "joint_position", "feature", "feature_valid", "valid"
+    return trusted_observation(seen[0].time, *(np.stack([getattr(each, name) for each in seen]) for name in names))

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 import typer
 
 from servobench.harness.cli import options
-from servobench.harness.cli.options import CONTROLLER, option
+from servobench.harness.cli.options import CONTROLLER, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
@@ -32,16 +32,20 @@ def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
     folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
+    aids: Annotated[bool, named_option("--aids", "", "A controller with the aids of the bench's methods.")] = False,
 ) -> None:
     """Write a commented controller or plant, and its test."""
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
         raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
+    if aids and kind != "controller":
+        raise ConfigurationError(f"--aids are those of a controller; leave the option out for a {kind}")
     module = name.removesuffix(".py")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module) or keyword.iskeyword(module) or module.startswith(PREFIX):
         raise ConfigurationError(f"the name must be one of a Python module, such as my_law, got {name!r}")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
-    wanted = {folder / f"{module}.py": kind, folder / f"{PREFIX}{module}.py": f"{PREFIX}{kind}"}
+    templates = "aided_controller" if aids else kind, f"{PREFIX}{kind}"
+    wanted = dict(zip((folder / f"{module}.py", folder / f"{PREFIX}{module}.py"), templates, strict=True))
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")

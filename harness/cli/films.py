@@ -88,13 +88,15 @@ def record(
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import engine_of, rendered_plant
-    from servobench.harness.pictures.film import GIF, KINDS, MP4, find_kind, write_recording
+    from servobench.harness.pictures.film import GIF, KINDS, MP4, write_recording
     from servobench.harness.pictures.replay import stretch
 
     film = out if out is not None and out.suffix.removeprefix(".") in (MP4, GIF) else None
     if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
         raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
-    wanted = selection.split_names("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS, find_kind)
+    wanted = selection.split_names(
+        "kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS, selection.among("kinds", KINDS)
+    )
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:

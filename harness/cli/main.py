@@ -23,14 +23,16 @@ from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
 HELP_NAMES: Final = ["-h", "--help"]
+PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
 COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
 BASH: Final = "complete_bash"
 WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
-    "First steps": (runs.run, runs.compare, results.statistics, results.report, record),
+    "First steps": (runs.run, runs.compare, results.statistics, results.report, results.figures, record),
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
     "Studies": (studies.sweep, analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
@@ -82,6 +84,30 @@ def _hide_types(root: Any) -> None:  # noqa: ANN401 - typer's own classes have n
         _hide_types(subcommand)
 
 
+def in_known_number(root: Any, words: list[str]) -> list[str]:  # noqa: ANN401 - typer's own classes
+    """Return the words of a call with options that the command has in the plural or the singular only called so.
+
+    One `--seed 7` is the list of this seed where the command takes `--seeds`, whose plain number is a count.
+    """
+    called = root
+    for word in words[:2]:  # a group such as fmu has commands of its own
+        called = getattr(called, "commands", {}).get(word, called)
+    name, known = called.name, {option for each in called.params for option in each.opts}
+    for k, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        others = [option.removesuffix(old) + new for old, new in PLURALS if option.endswith(old)]
+        if not option.startswith("--") or option in known or (name, option) in ABSENT or not known.intersection(others):
+            continue
+        other = next(each for each in others if each in known)
+        words = [*words[:k], other + equals + value, *words[k + 1 :]]
+        at = k if equals else k + 1
+        if option == "--seed" and at < len(words) and words[at].rpartition("=")[2].isdigit():
+            words[at] += ","
+        elif option == "--seeds":
+            remark(f"{name} has one seed, the number of --seed; compare and sweep take several")
+    return words
+
+
 def _no_type(ctx: object) -> None:
     """Return no type: the help of an argument says enough."""
 
@@ -95,7 +121,9 @@ def main() -> None:
         _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")
     try:
         with rejoining_words():
-            code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
+            root = command_line()
+            words = in_known_number(root, sys.argv[1:]) or ["--help"]
+            code = root(words, prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def statistics(
         say(missing)
     tables = statistics_tables(runs, metric)
     print_markdown(tables) if markdown else print_tables(tables)
+    say_aids(folder)
 
 
 def report(
@@ -69,6 +71,51 @@ def report(
     With figures, sortable tables and paths to turn; it needs no network.
     """
     make_report(folder, out)
+
+
+def figures(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
+    kind: Annotated[str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")] = "all",
+    controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
+    names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
+    width: Annotated[str, option("LENGTH", "Width, such as 3.5in, 8.9cm or 89mm, of a column of a paper.")] = "7.2in",
+    title: Annotated[bool, named_option("--title/--no-title", "", "Write what it shows above each figure.")] = True,
+    format_: Annotated[
+        str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")
+    ] = "pdf",
+    out: Annotated[Path | None, option("FOLDER", "Folder of the figures; default: figures in the folder.")] = None,
+) -> None:
+    """Draw figures of a folder for a paper.
+
+    They are those of the report, with chosen kinds, controllers, names and width; nothing is simulated for them.
+    """
+    from servobench.harness.batch import results
+    from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
+    from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
+
+    formats = selection.split_names("format", format_, ALL_FORMATS, selection.among("format", ALL_FORMATS))
+    kinds = selection.split_names("kind", kind, tuple(KINDS), selection.among("kind", tuple(KINDS)))
+    known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
+    shown = selection.split_names("controllers", controllers, known, selection.among("controllers", known))
+    own = [name.strip() for name in names.split(",")] if names else shown
+    if len(own) != len(shown):
+        raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
+    if "pgf" in formats:
+        check_tex()
+    if missing := results.describe_missing(folder):
+        say(missing)
+    choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
+    target = out or folder / FOLDER
+    with console.status("drawing the figures"), writing(target):
+        files = [
+            path
+            for named in folder_figures(folder, choice)
+            for path in save_figure(named.figure, target / named.stem, formats, exact_width=True)
+        ]
+    if not files:
+        kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
+        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+    say("\n".join(map(str, files)))
 
 
 def make_report(folder: Path, out: Path | None = None) -> None:
@@ -138,6 +185,14 @@ def export(
         say(missing)
     files = export_folder(folder, out, format_)
     say(f"{len(files)} files in {out}")
+
+
+def say_aids(folder: Path) -> None:
+    """Print which controllers of a folder have the aids, where it has several."""
+    from servobench.harness.analysis.folder import describe_controllers
+
+    if line := describe_controllers(folder):
+        say(line)
 
 
 def print_faults(runs: pd.DataFrame) -> None:

@@ -10,7 +10,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option
-from servobench.harness.cli.results import judge, make_report, print_faults
+from servobench.harness.cli.results import judge, make_report, print_faults, say_aids
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
@@ -163,6 +163,7 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
+    say_aids(folder)
     print_faults(runs)
     if latest:
         point_latest(folder)

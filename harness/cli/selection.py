@@ -194,6 +194,18 @@ def split_words(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def among(option: str, known: Sequence[str]) -> Callable[[str], str]:
+    """Return a function that returns a word which is one of `known`, and refuses another one with a suggestion."""
+    from servobench.plant.contract.settings import suggest
+
+    def find(word: str) -> str:
+        if word not in known:
+            raise ConfigurationError(f"--{option}: unknown {word!r}: {suggest(word, known)}")
+        return word
+
+    return find
+
+
 def split_names(
     option: str,
     text: str,

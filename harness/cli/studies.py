@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
-from servobench.harness.cli.results import judge
+from servobench.harness.cli.results import judge, say_aids
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -57,6 +57,7 @@ def sweep(
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
+    say_aids(out)
     say(f"table in {out / results.RUNS}")
     judge(out, results.iterate_runs(out, ("status",)), strict=judging.strict)
 
@@ -186,13 +187,17 @@ def tune(
         str, option(CONTROLLER.several(), "Comma-separated names, or all that have a search space.")
     ] = "all",
     studies: Annotated[
-        int, option("COUNT", "Studies of each method; the one that is best on a second set of robots is taken.")
+        int,
+        option(
+            "COUNT",
+            "Studies of each method; their results and the values in use meet on a second set of robots.",
+        ),
     ] = 3,
     trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
         int, option("COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, option("COUNT", "Robots under each condition of a trial.")] = 12,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[

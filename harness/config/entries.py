@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar, get_type_hi
 
 import numpy as np
 
+from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.config.source import PLACE, SourceFile, describe_at, digest_of_module, import_user_module, show
 from servobench.plant.bench.bench import Bench, build_bench
@@ -250,7 +251,12 @@ class _ControllerKind(Kind[ControllerEntry]):
 
     def check(self, entry: ControllerEntry, place: str) -> ControllerEntry:
         check_settings(entry.config, place)
-        return replace(entry, build=_guarded(entry.build, Controller))
+        guarded = replace(entry, build=(build := _guarded(entry.build, Controller)))
+        aids = getattr(build.make, "aids", None)
+        try:
+            return guarded if aids is None else with_aids(guarded, aids)
+        except ValueError as error:
+            raise ConfigurationError(f"{place}: {error}") from error
 
 
 class _PlantKind(Kind[PlantEntry]):

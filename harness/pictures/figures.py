@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pandas as pd
 from matplotlib.figure import Figure
 
+from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
-from servobench.harness.pictures.measures import FIGURES, draw_measures, draw_step_times
+from servobench.harness.pictures.measures import FIGURES, draw_conditions, draw_measures, draw_step_times
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import (
     draw_features,
@@ -38,31 +40,58 @@ from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles,
 FOLDER = "figures"
 LETTERS = 15.0  # of a title in an inch
 TASKS_A_FIGURE = 4  # also blocks of paths
-HEADINGS = {
-    "errors": "Error of moves over time",
-    "features": "Measured features of moves",
-    "paths": "True paths of moves, to scale",
-    "tracking": "Error along the curve, and measured features",
-    "tracking_path": "Desired and true path, to scale",
-    "jacobian": "Error of the estimated Jacobian",
-    "settling": "When each run settled, and with what error it ended",
-    "effort": "Control effort and saturation of each run",
-    "smoothness": "How smoothly each run drives the joints",
-    "step_times": "Time of a controller's step",
-    "joint_speeds": "Commanded motion of the joints",
+FIRST, OVER, EACH = "first seed", "median and band over seeds", "each seed"
+
+
+class Kind(NamedTuple):
+    """A kind of figure, for `run`, the report and `figures` alike."""
+
+    heading: str
+    seeds: str  # FIRST, OVER or EACH
+    in_page: bool = True  # whether the report shows it
+
+
+KINDS: Final = {
+    "conditions": Kind("Settled moves over each varied condition, all others together; bands are 95 % intervals", EACH),
+    "errors": Kind("Error of moves over time", OVER),
+    "features": Kind("Measured features of moves", FIRST, in_page=False),
+    "paths": Kind("True paths of moves, to scale", FIRST),
+    "tracking": Kind("Error along the curve, and measured features", OVER),
+    "tracking_path": Kind("Desired and true path, to scale", FIRST),
+    "jacobian": Kind("Error of the estimated Jacobian", OVER),
+    "settling": Kind("When each run settled, and with what error it ended", EACH),
+    "effort": Kind("Control effort and saturation of each run", EACH, in_page=False),
+    "smoothness": Kind("How smoothly each run drives the joints", EACH),
+    "step_times": Kind("Step of the controller", EACH),
+    "joint_speeds": Kind("Commanded motion of the joints", FIRST, in_page=False),
 }
-OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
-OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
 
 
 class NamedFigure(NamedTuple):
     """A figure with its name and heading."""
 
-    kind: str  # one of HEADINGS
+    kind: str  # one of KINDS
     stem: str  # name of its file without ending
     title: str  # the heading, and the place and seeds of its runs
-    tasks: tuple[str, ...]  # that it shows
+    tasks: tuple[str, ...]  # that it shows; none if it is of all
     figure: Figure
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The figures that are wanted of a folder, and their appearance.
+
+    Attributes:
+        kinds: some of KINDS.
+        names: controllers that are shown, with the names that they have in the figures; None for all.
+        layout: of the figures; a narrow one shows tasks one by one.
+        title: whether the figures have titles.
+    """
+
+    kinds: Collection[str] = tuple(KINDS)
+    names: Mapping[str, str] | None = None
+    layout: Layout = WIDE
+    title: bool = True
 
 
 def draw_figures(folder: Path) -> list[Path]:
@@ -71,33 +100,37 @@ def draw_figures(folder: Path) -> list[Path]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    return [
-        path
-        for named in folder_figures(folder)
-        for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))
-    ]
+    figures = folder_figures(folder)
+    return [path for named in figures for path in save_figure(named.figure, folder / FOLDER / named.stem, ("png",))]
 
 
-def folder_figures(folder: Path) -> Iterator[NamedFigure]:
-    """Yield every figure of a results folder, one in memory at a time.
+def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFigure]:
+    """Yield the chosen figures of a results folder, one in memory at a time.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    for group, plan in _folder_plans(folder, results.load_runs(folder), TASKS_A_FIGURE):
-        if (named := _carry_out(group, plan, WIDE)) is not None:
+    runs = results.load_runs(folder)
+    styles = method_styles(runs["controller"].tolist())
+    if choice.names is not None:
+        runs = runs[runs["controller"].isin(list(choice.names))]
+        runs = runs.assign(controller=runs["controller"].map(choice.names))
+        styles = {shown: styles[name] for name, shown in choice.names.items()}
+    size = TASKS_A_FIGURE if choice.layout.wide else 1
+    for group, plan in _folder_plans(folder, runs, styles, size):
+        if plan.kind in choice.kinds and (named := _carry_out(group, plan, choice.layout, title=choice.title)):
             yield named
 
 
 def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
-    """Yield the figures of some kinds (keys of `HEADINGS`) for a page, each wide and narrow; tasks one by one.
+    """Yield the figures of some kinds (keys of `KINDS`) for a page, each wide and narrow; tasks one by one.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    for group, plan in _folder_plans(folder, runs, 1):
+    for group, plan in _folder_plans(folder, runs, method_styles(runs["controller"].tolist()), 1):
         if plan.kind in kinds:
-            wide, narrow = (_carry_out(group, plan, layout) for layout in (WIDE, NARROW))
+            wide, narrow = (_carry_out(group, plan, layout, title=False) for layout in (WIDE, NARROW))
             if wide is not None and narrow is not None:
                 yield wide, narrow
 
@@ -111,24 +144,27 @@ class _Plan(NamedTuple):
     draw: Callable[[Layout], Figure | None]
 
 
-def _folder_plans(folder: Path, runs: pd.DataFrame, size: int) -> Iterator[tuple[Group, _Plan]]:
+def _folder_plans(folder: Path, runs: pd.DataFrame, styles: Styles, size: int) -> Iterator[tuple[Group, _Plan]]:
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
-    styles = method_styles(runs["controller"].tolist())
+    if len(runs):
+        everything = Group("", "", runs, int(runs["seed"].min()), {})
+        yield everything, _Plan("conditions", "", (), partial(draw_conditions, split_tasks(runs)[0], styles))
     for group in load_groups(folder, runs):
         for plan in _plans(group, load_ensembles(folder, group.runs), styles, size):
             yield group, plan
 
 
-def _carry_out(group: Group, plan: _Plan, layout: Layout) -> NamedFigure | None:
+def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> NamedFigure | None:
     """Return a figure with its name and heading."""
     with figure_style(TEXT):
         figure = plan.draw(layout)
     if figure is None:
         return None
-    heading, place = HEADINGS[plan.kind], f"{group.plant}, mismatch {group.mismatch}"
+    heading, place = KINDS[plan.kind].heading, f"{group.plant}, mismatch {group.mismatch}" if group.plant else ""
     details = ", ".join(filter(None, (plan.part, place, _sample(plan.kind, group))))
-    wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
-    figure.suptitle(f"{heading}\n{wrapped}", fontsize=TEXT + 1.0)
+    if title:
+        wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
+        figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
     words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
     stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
     return NamedFigure(plan.kind, stem, f"{heading}: {details}", plan.tasks, figure)
@@ -136,10 +172,10 @@ def _carry_out(group: Group, plan: _Plan, layout: Layout) -> NamedFigure | None:
 
 def _sample(kind: str, group: Group) -> str:
     """Return words for the seeds that a figure shows, and how."""
-    seeds = group.runs["seed"].nunique()
-    if kind in OF_FIRST_SEED or seeds == 1:
+    seeds, how = group.runs["seed"].nunique(), KINDS[kind].seeds
+    if how == FIRST or seeds == 1:
         return f"seed {group.seed}"
-    if kind not in OVER_SEEDS:
+    if how == EACH:
         return f"{seeds} seeds"
     words = f"median of {seeds} seeds, band: the middle 80 %"
     return f"{words}; features of seed {group.seed}" if kind == "tracking" else words

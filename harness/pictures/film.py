@@ -30,7 +30,6 @@ from servobench.harness.pictures.responses import mark_settling_band
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import suggest
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.workspace import BALL_RADIUS
 
@@ -51,17 +50,6 @@ GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
 QUALITY = "22"  # of H.264: smaller is better and larger
 Write = Callable[[ByteArray], None]
 """Appends a frame (height, width, 3) to a film."""
-
-
-def find_kind(name: str) -> str:
-    """Return `name` if it is a kind of recording.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
-    if name not in KINDS:
-        raise ConfigurationError(f"--kinds: unknown {name!r}: {suggest(name, KINDS)}")
-    return name
 
 
 def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:

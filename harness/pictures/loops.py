@@ -57,11 +57,11 @@ def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
         limits.plot(1000.0 * LATENCIES, loop.gain_limits(LATENCIES.tolist()), **style.line_arguments(len(LATENCIES)))
     _finish_frequencies(magnitude, phase, peaks)
     _finish_nyquist(nyquist)
-    step.set(xlabel="time [s]", ylabel="feature after a unit step", ylim=(-0.05, 1.6))
+    step.set(title="Step of the reference", xlabel="time [s]", ylabel="feature", ylim=(-0.05, 1.6))
     limits.axhline(1.0, color="0.4", linewidth=0.9)
     latency = 1000.0 * loops[0].arm.latency
     limits.axvline(latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
-    limits.set(xlabel="latency of the camera [ms]", ylabel="largest factor on the command", ylim=(0.3, 20.0))
+    limits.set(title="Gain margin", xlabel="latency of the camera [ms]", ylabel="factor on command", ylim=(0.3, 20.0))
     plain_logarithms(limits)
     add_legend(figure, [magnitude])
     return figure
@@ -131,12 +131,12 @@ def _finish_frequencies(magnitude: Axes, phase: Axes, peaks: Axes) -> None:
     for axes in (magnitude, phase, peaks):
         axes.set_xscale("log")
         axes.set_xlabel("frequency [rad/s]")
-    magnitude.set(ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
+    magnitude.set(title="Open loop L", ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
     magnitude.axhline(1.0, color="0.4", linewidth=0.9)
     plain_logarithms(magnitude)
-    phase.set(ylabel="phase of the loci of L [°]", ylim=(-540.0, 0.0), yticks=range(-540, 1, 90))
+    phase.set(title="Open loop L", ylabel="phase of the loci of L [°]", ylim=(-540.0, 0.0), yticks=range(-540, 1, 90))
     phase.axhline(-180.0, color="0.4", linewidth=0.9)
-    peaks.set(ylabel="largest singular value of S", ylim=(0.03, 5.0))
+    peaks.set(title="Sensitivity S = (I + L)⁻¹", ylabel="largest singular value of S", ylim=(0.03, 5.0))
     plain_logarithms(peaks)
 
 
@@ -144,5 +144,5 @@ def _finish_nyquist(axes: Axes) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=0.9)
     axes.plot(-1.0, 0.0, color="black", marker="+", markersize=11, markeredgewidth=1.6)
-    axes.set(xlabel="real part of the loci of L", ylabel="imaginary part", aspect="equal",
+    axes.set(title="Nyquist plot of L", xlabel="real part of the loci of L", ylabel="imaginary part", aspect="equal",
              xlim=(-NYQUIST_REACH, 1.0), ylim=(-NYQUIST_REACH, 1.0))  # fmt: skip

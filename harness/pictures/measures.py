@@ -74,7 +74,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     if not rows:
         return None
     alone = runs["task"].nunique() == 1
-    figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles)
+    figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles, layout)
     notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
     notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
     if _never(runs, rows[0]).any():
@@ -85,18 +85,18 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     return figure
 
 
-def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles) -> Figure:
+def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout: Layout) -> Figure:
     """Draw measures of several tasks: a row a measure, a column a task."""
     tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
     height = 0.55 + LINE * max(LEAST_ROWS, len(names))
-    figure = Figure(figsize=(WIDE.width, 0.65 + len(rows) * height), layout="constrained")
+    figure = Figure(figsize=(layout.width, 0.65 + len(rows) * height), layout="constrained")
     parts = np.atleast_1d(np.array(figure.subfigures(len(rows), 1), dtype=object))
     for part, row in zip(parts, rows, strict=True):
         panels = part.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
         for axes, task in zip(panels, tasks, strict=True):
             _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
             axes.set_title(task)
-            _name_rows(axes, names, WIDE)
+            _name_rows(axes, names, layout)
         part.supxlabel(_label(row, runs), fontsize=TEXT)
     return figure
 
@@ -146,10 +146,10 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
     top = 1.4 * max(float(np.max(values)) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
         words = _draw_times(axes, i, values, limit, styles[name])
-        if layout is WIDE:
+        if layout.wide:
             axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
                           fontweight="bold" if "\n" in words else None, linespacing=1.0)  # fmt: skip
-    if layout is WIDE:
+    if layout.wide:
         axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom",
                       fontsize=TEXT - 0.5, xytext=(0, 2), textcoords="offset points")  # fmt: skip
     if math.isfinite(limit):
@@ -343,7 +343,6 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
         draw_curves(axes, sizes, values, styles, top=104.0)
         axes.set_xlabel(label)
     label_rows(panels, "settled runs [%]")
-    figure.suptitle("Settled moves over each varied condition; bands are 95 % intervals", fontsize=TEXT + 1.0)
     add_legend(figure, panels)
     return figure
 

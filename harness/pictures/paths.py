@@ -56,8 +56,8 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     rows = -(-len(blocks) // columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
     ratios = [max(block.extent.ratio(view) for block in line) for line in lines for view in views]
-    width = SINGLE if layout is WIDE and columns == 1 else layout.width / columns - BESIDE
-    lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout is WIDE else 1.0)
+    width = SINGLE if layout.wide and columns == 1 else layout.width / columns - BESIDE
+    lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout.wide else 1.0)
     height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
     figure = Figure(figsize=(layout.width, height), layout="compressed")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)

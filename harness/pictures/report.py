@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
-from matplotlib.figure import Figure
 
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import tables
@@ -30,24 +29,20 @@ from servobench.harness.analysis.comparison import (
     outcomes,
     settling_band,
     shown_unit,
-    split_tasks,
     texts_of,
 )
-from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, other_tables
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.pictures.figures import page_figures
-from servobench.harness.pictures.measures import draw_conditions
+from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import (
     NARROW,
-    TEXT,
     WIDE,
     Drawing,
     MethodStyle,
     drawing_of,
-    figure_style,
     method_styles,
 )
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, load_tables, longest
@@ -67,7 +62,6 @@ LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line 
 COUNTED: Final = {"controller": "controllers", "task": "tasks", "plant": "plants", "mismatch": "mismatches"}
 USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}  # not mentioned
 SWEPT: Final = {"noise_factor": "factors of noise", "latency_s": "latencies", "period_s": "control periods"}
-KINDS: Final = ("errors", "paths", "settling", "tracking", "tracking_path", "jacobian", "step_times", "smoothness")
 MOST_POINTS = 150  # of a path; more cannot be distinguished
 MOST_VIEWS = 24  # plant, mismatch and task
 CURVE_POINTS = (40, 160)  # of the error of a run: at least, at most
@@ -90,7 +84,7 @@ FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
 class Picture(NamedTuple):
     """A figure of the page."""
 
-    kind: str  # a key of `servobench.harness.pictures.figures.HEADINGS`
+    kind: str  # a key of `servobench.harness.pictures.figures.KINDS`
     title: str  # alternative text
     tasks: tuple[str, ...]  # that it shows; none if it is of all
     wide: Drawing  # for a sheet of paper, a notebook and most screens
@@ -127,20 +121,9 @@ def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
 
 
 def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
-    styles = method_styles(runs["controller"])
-    with figure_style(TEXT):
-        wide, narrow = (draw_conditions(split_tasks(runs)[0], styles, layout) for layout in (WIDE, NARROW))
-    if wide is not None and narrow is not None:
-        title = "Share of moves that settle over each condition, all others together; bands are 95 % intervals"
-        yield _picture("conditions", title, (), wide, narrow)
-    for named, slim in page_figures(folder, runs, KINDS):
-        yield _picture(named.kind, named.title, named.tasks, named.figure, slim.figure)
-
-
-def _picture(kind: str, title: str, tasks: tuple[str, ...], wide: Figure, narrow: Figure) -> Picture:
-    for figure in (wide, narrow):
-        figure.suptitle("")  # the page has it as a caption
-    return Picture(kind, title, tasks, drawing_of(wide, WIDE), drawing_of(narrow, NARROW))
+    for named, slim in page_figures(folder, runs, [name for name, kind in KINDS.items() if kind.in_page]):
+        wide, narrow = drawing_of(named.figure, WIDE), drawing_of(slim.figure, NARROW)
+        yield Picture(named.kind, named.title, named.tasks, wide, narrow)
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
@@ -167,6 +150,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         verdict=judge(runs),
         leaders=leaders(runs),
         scope=_scope(runs, facts),
+        aids=describe_controllers(folder),
         band=settling_band(runs),
         following=settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,

@@ -157,8 +157,8 @@ def _draw_tasks(
         for head, names in divisions(ensembles).items()
     ]
     names = {name for ensembles in tasks.values() for name in ensembles}
-    row = 2.8 if layout is WIDE and len(cells) == 1 else 2.0
-    head = 0.6 + LINE * (2 + len(names) * (0.25 if layout is WIDE else 1.0))
+    row = 2.8 if layout.wide and len(cells) == 1 else 2.0
+    head = 0.6 + LINE * (2 + len(names) * (0.25 if layout.wide else 1.0))
     figure, panels = panel_grid(len(cells), row, replace(layout, columns=min(COLUMNS, layout.columns)), head)
     for axes, (task, heading, ensembles) in zip(panels, cells, strict=True):
         draw(axes, ensembles, styles)
@@ -266,7 +266,7 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
 def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
     """Draw the commanded joint motion of one run of each controller until a time [s]; None without commands.
 
-    A long run is shown at its end. Three columns need a wide layout.
+    A long run is shown at its end. A wide layout has room for a metric in each panel.
     """
     shown = each(Track.closing, tracks)
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
@@ -280,12 +280,12 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
             _draw_joint(line, track, column, number)
         for axes, (_, metric, form) in zip(line, QUANTITIES, strict=True):
             known = track.row.get(metric)
-            words = "" if known is None or np.isnan(known) else form.format(known)
+            words = "" if known is None or np.isnan(known) or not layout.wide else form.format(known)
             axes.text(0.985, 0.93, words, transform=axes.transAxes, ha="right", va="top", fontsize=TEXT - 1.5,
                       bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0})  # fmt: skip
         line[0].set_ylabel(name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5)
     for axes, (title, _, _) in zip(panels[0], QUANTITIES, strict=True):
-        axes.set_title(title)
+        axes.set_title(title if layout.wide else title.replace(" [", "\n["))
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     if until > 0.0 and not longest(tracks).long:  # a run may end in its first period

@@ -6,6 +6,7 @@ import base64
 import io
 import math
 import re
+import shutil
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -22,6 +23,8 @@ from PIL import Image
 
 from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.units import split_quantity
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
@@ -33,6 +36,15 @@ MOST_LINES = 7  # of methods in a panel, not counting those that know the true r
 TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
+ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
+INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4}  # unit -> how many of it are an inch
+TWO_COLUMNS: Final = 5.0  # [in] from which on panels stand beside each other
+TEX: Final = ("pdflatex", "lualatex", "xelatex")  # programs with which pgf measures its text
+UNDATED: Final[dict[str, Any]] = {
+    "pdf": {"metadata": {"CreationDate": None}},
+    "svg": {"metadata": {"Date": None}},
+    "png": {"metadata": {"Software": None}},
+}
 RESOLUTION = 150  # dpi of PNG
 PALETTE = 64  # colours
 STRIP = 0.04  # [in] above and below what is drawn
@@ -67,6 +79,24 @@ class Layout:
     columns: int  # panels beside each other, at most
     pixels: int  # [px] of a page that the width takes
     density: float  # pixels of a picture for each of the page's
+
+    @classmethod
+    def of_width(cls, text: str) -> Layout:
+        """Return the layout of a width such as `3.5in` or `89mm`; one below 5 in has its panels in one column.
+
+        Raises:
+            ConfigurationError: no length from 2 to 20 in.
+        """
+        number, unit = split_quantity(text) or (math.nan, "")
+        width = number / INCHES.get(unit, math.nan)
+        if not 2.0 <= width <= 20.0:
+            raise ConfigurationError(f"--width must be from 2in to 20in, as 3.5in, 8.9cm or 89mm, got {text}")
+        return cls(width, WIDE.columns if width >= TWO_COLUMNS else 1, WIDE.pixels, WIDE.density)
+
+    @property
+    def wide(self) -> bool:
+        """Whether panels stand beside each other."""
+        return self.columns > 1
 
     @property
     def scale(self) -> float:
@@ -177,7 +207,10 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
             "grid.alpha": 0.3,
             "axes.axisbelow": True,
             "svg.fonttype": "none",
+            "svg.hashsalt": "servobench",
             "pdf.fonttype": 42,
+            "pgf.texsystem": next(filter(shutil.which, TEX), TEX[0]),
+            "pgf.rcfonts": False,
         }
     )
 
@@ -253,17 +286,48 @@ def plain_logarithms(axes: Axes, which: Literal["x", "y"] = "y") -> None:
     axis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
 
 
-def save_figure(figure: Figure, stem: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write a figure in each format, by default PNG and PDF, under one name; the same figure gives the same bytes."""
+def check_tex() -> None:
+    """Refuse the format pgf where there is no TeX to measure its text.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    if not any(map(shutil.which, TEX)):
+        raise ConfigurationError(
+            f"--format pgf needs a TeX while it is drawn, {', '.join(TEX[:-1])} or {TEX[-1]}, and there is none; "
+            "on Debian: apt install texlive-latex-recommended texlive-pictures; pdf, svg and png need none"
+        )
+
+
+def save_figure(
+    figure: Figure, stem: Path, formats: Iterable[str] = FORMATS, *, exact_width: bool = False
+) -> list[Path]:
+    """Write a figure in each format, by default PNG and PDF, under one name; the same figure gives the same bytes.
+
+    Its width is that of the figure; with `exact_width` its height is that of what is drawn, without empty strips.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    paths = []
+    paths, box = [], None
+    if exact_width:
+        with figure_style(TEXT):
+            drawn = box_of(figure)
+            box = Bbox.from_extents(0.0, drawn.y0, figure.get_figwidth(), drawn.y1)
     for ending in formats:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
         with figure_style(TEXT):
-            metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
-            figure.savefig(paths[-1], dpi=RESOLUTION, metadata=metadata)
+            figure.savefig(paths[-1], dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
         figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
     return paths
+
+
+def box_of(figure: Figure) -> Bbox:
+    """Lay a figure out for good; return the box [in] as high as what is drawn and as wide as the figure."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)  # once, also for the edges of what is drawn
+        figure.set_layout_engine("none")
+    drawn = figure.get_tightbbox()
+    low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
+    return Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
 
 
 def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
@@ -273,12 +337,7 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
     """
     large, small = io.BytesIO(), io.BytesIO()
     with figure_style(TEXT):
-        if (engine := figure.get_layout_engine()) is not None:
-            engine.execute(figure)  # once, also for the edges of what is drawn
-            figure.set_layout_engine("none")
-        drawn = figure.get_tightbbox()
-        low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
-        box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
+        box = box_of(figure)
         figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
     # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:

@@ -13,6 +13,7 @@ from typing import Any, Final, final
 
 import numpy as np
 
+from servobench.controllers.aided import AidedController
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import ServoController
 from servobench.harness.run.result import WrongAnswer
@@ -37,7 +38,9 @@ class HeldController(Controller):
     """A controller whose answers are checked."""
 
     def __init__(self, controller: Controller, spec: PlantSpec) -> None:
-        """Take a controller and the spec of its plant."""
+        """Take a controller and the spec of its plant; with aids it is the user's controller that is checked, too."""
+        if isinstance(controller, AidedController):
+            controller.law.own = HeldController(controller.law.own, spec)
         self._controller, self._spec = controller, spec
         self._names: set[str] = set()
 

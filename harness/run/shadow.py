@@ -6,6 +6,7 @@ predicts a run under these commands; only the answers to the same observations a
 
 from __future__ import annotations
 
+import math
 from typing import Final, final
 
 import numpy as np
@@ -19,9 +20,16 @@ from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.robot.hand_eye import RobotModel
 
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
+FREE: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
+FAR: Final = 20.0  # [m] beyond which no feature is, in natural units
+SHORT: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
+LATE: Final = 12  # control periods by which features may be late
+ALIKE: Final = 0.35  # share of the motion by which features may differ without a remark
 TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
 
@@ -61,6 +69,45 @@ class LoggedPlant(Plant):
         known = set(true) <= set(table)
         self._true = table[true].to_numpy(np.float64) if known else np.full_like(self._features, np.nan)
 
+    def check_units(self, model: RobotModel | None) -> None:
+        """Refuse joints and features that no robot of this kind has, and remark on features that move otherwise.
+
+        Args:
+            model: of the robot that was logged; None where it is unknown.
+
+        Raises:
+            ConfigurationError: names the row, and the unit in which the log has to be.
+        """
+        spec, q = self.spec, self._joints
+        beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
+        row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
+        where = (
+            f"row {row} of the log has {spec.joint_names[joint]} at {q[row, joint]:g} rad, beyond its range of "
+            f"{spec.joint_lower[joint]:.4g} to {spec.joint_upper[joint]:.4g} rad"
+        )
+        if beyond.max() > math.pi:
+            raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
+        if beyond.max() > FREE:
+            remark(where)
+        sizes, unit = np.abs(self._features).max(axis=1), spec.feature.unit
+        far, size = int(sizes.argmax()), float(sizes.max())
+        if unit in ("m", "px") and size > FAR * spec.feature.scale:
+            meant = "; if the log is in mm, write it in m" if unit == "m" else ""
+            raise ConfigurationError(f"row {far} of the log has a feature of {size:g} {unit}, beyond any camera{meant}")
+        if model is not None and self._valid[LATE:].any():
+            self._check_motion(model)
+
+    def _check_motion(self, model: RobotModel) -> None:
+        """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
+        y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self._joints)))
+        rows = len(y) - np.arange(min(LATE, len(y) // 2))
+        apart = min(_apart(y[-k:][self._valid[-k:]], p[:k][self._valid[-k:]], self.spec.feature.unit) for k in rows)
+        if apart > ALIKE:
+            remark(
+                f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}: look for other "
+                "units, another order or sign of joints, another arm, or a camera that was moved"
+            )
+
     def reset(self, seed: int) -> Observation:
         """Go back to the first row; nothing is random. See `Plant.reset`."""
         self._k = 0
@@ -98,9 +145,10 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         ConfigurationError: settings or a log that cannot be used, or the controller failed.
     """
     experiment = build(resolved)
-    spec, request = experiment.plant.spec, resolved.request
+    spec, request, true = experiment.plant.spec, resolved.request, experiment.drawn.true
     try:
         plant = LoggedPlant(spec, table)
+        plant.check_units(true)
         log = StepLog(spec, len(table))
         loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
         desired = experiment.desired(loop.periods)
@@ -117,8 +165,26 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     steps = log.steps().table(request.run_id)
     names = column_names(spec)[COMMAND]
     if set(names) <= set(table):
-        steps[[LOGGED + name for name in names]] = _columns(table, names)
+        steps[[LOGGED + name for name in names]] = commands = _columns(table, names)
+        if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
+            remark(
+                f"commands of the log reach {np.abs(commands).max():g} rad/s; if they are in deg/s, write them in rad/s"
+            )
     return steps
+
+
+def _apart(y: FloatArray, p: FloatArray, unit: str) -> float:
+    """Return the share of the motion of features (k, m) that no image of the others explains; 0 for short motions."""
+    y, p = y - y.mean(axis=0), p - p.mean(axis=0)
+    seen, made = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (y, p))
+    if max(seen, made) < SHORT:
+        return 0.0
+    if unit == "m":
+        left, wide, right = np.linalg.svd(y.T @ p / len(p))  # the best turn of one path onto the other, by Kabsch
+        wide[-1] *= np.sign(np.linalg.det(left @ right))
+        return math.sqrt(max(seen**2 + made**2 - 2.0 * float(wide.sum()), 0.0)) / max(seen, made)
+    rest = np.linalg.norm(y - p @ np.linalg.lstsq(p, y, rcond=None)[0])
+    return 1.0 if 8.0 * seen < made else float(rest / np.linalg.norm(y))
 
 
 def has_commands(steps: pd.DataFrame) -> bool:

@@ -70,8 +70,6 @@ PositiveOrInfinite: TypeAlias = Annotated[float, Gt(0.0)]
 """A number above 0, or `inf` for no limit."""
 JointSpeed: TypeAlias = Annotated[Positive, Usual(20.0)]
 """The speed of a joint [rad/s]."""
-JointAngle: TypeAlias = Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * math.pi)]
-"""The position of a joint, or a limit of it [rad]."""
 Share: TypeAlias = Annotated[float, Ge(0.0), Le(1.0)]
 """From 0 to 1, both included."""
 ShareBelowOne: TypeAlias = Annotated[float, Ge(0.0), Lt(1.0)]

@@ -24,13 +24,23 @@ import logging
 from dataclasses import replace
 from math import isfinite, pi
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.files import read_toml, user_path
-from servobench.plant.contract.settings import Number, Positive, override, settings
+from servobench.plant.contract.settings import (
+    Check,
+    JointSpeed,
+    Number,
+    Positive,
+    Usual,
+    override,
+    read_value,
+    settings,
+)
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh, rpy_from_rotation
 from servobench.plant.robot.makers import MAX_DEVIATION, nearest_title, read_calibration, universal_robot
 from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
@@ -85,26 +95,31 @@ def _read_calibrated(path: Path) -> Robot:
     )
 
 
-Column = tuple[Number, ...]
+Lengths = tuple[Annotated[Number, Ge(-20.0), Le(20.0), Usual(5.0)], ...]
+Twists = tuple[Annotated[Number, Ge(-6.3), Le(6.3)], ...]
+Limits = tuple[Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * pi)], ...]
+LENGTHS: Final = Check.of(Lengths)
+LIMITS: Final = Check.of(tuple[Annotated[Number, Usual(4.0 * pi)], ...])
+SPEEDS: Final = Check.of(tuple[JointSpeed, ...])
 
 
 @settings
 class DhTable:
     """The keys of a file."""
 
-    a: Column
+    a: Lengths
     """[m] link lengths."""
-    d: Column
+    d: Lengths
     """[m] link offsets."""
-    alpha: Column
+    alpha: Twists
     """[rad] link twists."""
-    joint_lower: Column
+    joint_lower: Limits
     """[rad]"""
-    joint_upper: Column
+    joint_upper: Limits
     """[rad]"""
-    joint_speed: tuple[Positive, ...]
+    joint_speed: tuple[Annotated[JointSpeed, Le(60.0)], ...]
     """[rad/s]"""
-    theta: Column = ()
+    theta: Twists = ()
     """[rad] joint offsets; an empty list for none."""
     convention: Literal["standard", "modified"] = "standard"
     """Which of the two DH conventions."""
@@ -266,7 +281,8 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
     for joint in way:
         if joint.type not in (*TURNING, "fixed"):
             raise ValueError(f"joint {joint.name!r} on the way to {tip!r} is of type {joint.type}; name another link")
-        pose = pose @ (np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64))
+        pose = pose @ _pose(joint.origin)
+        read_value(f"joint {joint.name!r}: origin", tuple(pose[:3, 3].tolist()), LENGTHS, lambda: "m")
         if _turns(joint):
             aligned = _along(np.asarray(joint.axis, dtype=np.float64))
             chain.append(Joint(joint, pose @ aligned, aligned))
@@ -320,6 +336,9 @@ def _limits(chain: list[Joint]) -> JointLimits:
         if safety is not None and link.joint.type != "continuous":
             lower = max(lower, lower if safety.soft_lower_limit is None else safety.soft_lower_limit)
             upper = min(upper, upper if safety.soft_upper_limit is None else safety.soft_upper_limit)
+        name = f"joint {link.joint.name!r}"
+        read_value(f"{name}: limits", (float(lower), float(upper)), LIMITS, lambda: "rad")
+        read_value(f"{name}: velocity", (float(speed),), SPEEDS, lambda: "rad/s")
         rows.append((lower, upper, speed))
     lowers, uppers, speeds = np.array(rows, dtype=np.float64).T
     return JointLimits(lowers, uppers, speeds)

@@ -32,6 +32,7 @@ ONLY_READ = {
     "tune": "takes hours; test_tune_command.py makes a few trials",
     "analyse": "logs runs of each method, which test_analyse.py does",
     "report": "needs the folder of a run, which test_report.py makes",
+    "figures": "needs the folder of a run, which test_pictures.py makes",
     "statistics": "needs the folder of a run; docs/five_minutes.md carries it out",
     "export": "needs the folder of a batch; tests/harness/test_exports.py exports one",
     "shadow": "needs a logged run; tests/harness/test_shadow.py shows some",
@@ -82,7 +83,7 @@ def test_every_line_is_one_that_the_command_line_reads(words):
         if "--help" not in rest:
             with suppress(ConfigurationError) if own else nullcontext():  # of a file that is the reader's
                 context = command.make_context(name, rest, parent=context)
-    options = {option for each in command.params for option in each.opts} | {"--help"}
+    options = {option for each in command.params for option in (*each.opts, *each.secondary_opts)} | {"--help"}
     assert {word for word in words if word.startswith("--")} <= options
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,26 @@ import pytest
 from matplotlib.text import Text
 from PIL import Image
 
+from kit.command import servobench
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
-from servobench.harness.pictures.figures import HEADINGS, draw_figures, folder_figures, page_figures
+from servobench.harness.pictures import style
+from servobench.harness.pictures.figures import KINDS, Choice, draw_figures, folder_figures, page_figures
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import path_views
-from servobench.harness.pictures.style import ENDED, NARROW, TEXT, WIDE, figure_style, fitted, method_styles, picture_of
+from servobench.harness.pictures.style import (
+    ENDED,
+    NARROW,
+    TEXT,
+    WIDE,
+    Layout,
+    figure_style,
+    fitted,
+    method_styles,
+    picture_of,
+)
 from servobench.harness.pictures.tracks import Track, load_groups
 from servobench.plant.contract.checksums import write_vouched
 
@@ -66,7 +79,7 @@ def test_a_comparison_gives_the_figures_of_the_paper_and_more(tmp_path):
 
 def test_the_page_of_results_names_every_kind_of_figure_in_its_order():
     text = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8").split("## Figures")[1]
-    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(HEADINGS)
+    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(KINDS)
 
 
 def test_every_axis_of_every_figure_has_a_unit_and_the_figure_names_every_controller(tmp_path):
@@ -209,10 +222,10 @@ def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last
     assert short.overview() is short.closing() is short.for_path() is short
 
 
-@pytest.mark.parametrize("folder", [sweep, failed_only])
-def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder):
-    assert draw_figures(folder(tmp_path / "out")) == []
-    assert not (tmp_path / "out" / "figures").exists()
+@pytest.mark.parametrize(("folder", "wanted"), [(sweep, ["conditions.png"]), (failed_only, [])])
+def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder, wanted):
+    assert [path.name for path in draw_figures(folder(tmp_path / "out"))] == wanted
+    assert (tmp_path / "out" / "figures").exists() == bool(wanted)
 
 
 def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp_path):
@@ -260,3 +273,73 @@ def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
     (group,) = load_groups(folder, results.load_runs(folder))
     assert group.seed == 3
     assert group.tasks["exp1"]["ukf_mfac"].row["run_id"] == "run3"
+
+
+def paper(monkeypatch, folder, *arguments):
+    """Return the exit code of `servobench figures` for a column of a paper, and the files that it made."""
+    out = folder.parent / "paper"
+    code = servobench(monkeypatch, "figures", str(folder), "--width", "3.5in", "--out", str(out), *arguments)
+    return code, sorted(out.glob("*")) if out.exists() else []
+
+
+def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_path):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "mine"))
+    code, files = paper(monkeypatch, folder, "--no-title", "--names", "Proposed,$K_p$ alone")
+    assert code == 0
+    wanted = {name for name, kind in KINDS.items() if kind.in_page} - {"conditions"}
+    assert {kind for kind in wanted if any(path.name.startswith(f"{kind}_") for path in files)} == wanted
+    for path in files:
+        content = path.read_bytes()
+        assert re.search(rb"/MediaBox \[ ?0 0 (\S+) ", content)[1] == b"252", path.name
+        assert b"/Type3" not in content
+
+
+def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_style(tmp_path):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "mine", "rls"))
+    choice = Choice(("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False)
+    figures = list(folder_figures(folder, choice))
+    assert [named.tasks for named in figures] == [("exp1",), ("exp2",)]
+    for named in figures:
+        assert named.figure.get_suptitle() == ""
+        colours = {line.get_label(): line.get_color() for line in named.figure.axes[0].get_lines()}
+        assert colours["UKF+MFAC"] == method_styles(["rls"])["rls"].colour
+        assert colours["Mine"] == method_styles(["ukf_mfac"])["ukf_mfac"].colour
+        assert "mine" not in colours
+
+
+def test_figures_come_in_the_formats_that_are_asked_for_and_the_same_each_time(monkeypatch, tmp_path):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
+    _, files = paper(monkeypatch, folder, "--kind", "errors", "--format", "pdf,svg,png")
+    before = {path.name: path.read_bytes() for path in files}
+    assert [path.suffix for path in files] == [".pdf", ".png", ".svg"]
+    _, files = paper(monkeypatch, folder, "--kind", "errors", "--format", "pdf,svg,png")
+    assert before == {path.name: path.read_bytes() for path in files}
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
+def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
+    _, (path,) = paper(monkeypatch, folder, "--kind", "errors", "--format", "pgf")
+    width = re.search(r"\\pgfpathrectangle\{\\pgfpointorigin\}\{\\pgfqpoint\{([\d.]+)in", path.read_text())[1]
+    assert float(width) == pytest.approx(3.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--kind", "error"), "--kind: unknown 'error': did you mean 'errors'?"),
+        (("--controllers", "ukf_mfca"), "--controllers: unknown 'ukf_mfca': did you mean 'ukf_mfac'?"),
+        (("--names", "a,b"), "--names has 2 names for 1 controllers: ukf_mfac"),
+        (("--width", "3.5"), "--width must be from 2in to 20in, as 3.5in, 8.9cm or 89mm, got 3.5"),
+        (("--format", "eps"), "--format: unknown 'eps': "),
+        (("--format", "pgf"), "--format pgf needs a TeX while it is drawn, pdflatex, lualatex or xelatex, and there"),
+        (("--kind", "tracking"), "has no figure of tracking"),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_line(monkeypatch, capsys, tmp_path, arguments, line):
+    monkeypatch.setattr(style.shutil, "which", lambda _: None)
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
+    assert paper(monkeypatch, folder, *arguments) == (2, [])
+    error = capsys.readouterr().err
+    assert line in error
+    assert error.count("\n") == 1

@@ -84,9 +84,74 @@ def test_what_is_no_defect_is_a_note(tmp_path, what):
 def test_a_whole_controller_passes_every_check(tmp_path, text):
     write(tmp_path, text)
     report = servobench.check_controller("./mine.py")
-    assert {each.verdict for each in report.findings} == {"ok"}
-    assert len(report.findings) == 16
+    assert {each.check for each in report.findings if each.verdict != "ok"} == {"aids", "side by side"}
+    assert {each.verdict for each in report.findings} == {"ok", "note"}
+    assert len(report.findings) == 18
     assert str(report).startswith("Mine:\nok     constructor\nok     command\n")
+
+
+def findings(subject):
+    """Return verdict and line of each check."""
+    return {each.check: (each.verdict, each.text) for each in check_controller(subject).findings}
+
+
+def test_it_is_said_what_gives_a_class_the_aids_and_why_it_cannot_have_them(tmp_path):
+    write(tmp_path, WHOLE)
+    assert findings("./mine.py")["aids"][1].startswith("without aids; `aids = servobench.EQUIPPED` in the class gives")
+    write(tmp_path, WHOLE.replace('"""Does not move."""', "aids = servobench.EQUIPPED"))
+    assert findings("./mine.py")["aids"] == ("ok", "")
+    write(tmp_path, WHOLE.replace("np.zeros(self.n)", "0.0 * reference[1, 0] * np.ones(self.n)"))
+    line = "without aids, and it cannot have them as it is: mine.py:16: IndexError"
+    assert findings("./mine.py")["aids"][1].startswith(line)
+
+
+def test_an_answer_that_is_no_command_has_its_place_also_within_the_chain_of_the_aids(tmp_path):
+    text = WHOLE.replace('"""Does not move."""', "aids = servobench.EQUIPPED")
+    write(tmp_path, text.replace("servobench.Command(np.zeros(self.n))", "np.zeros(self.n)"))
+    assert findings("./mine.py")["command"][1].startswith("mine.py:15: step must return a Command, got ndarray")
+
+
+IN_PARTS = """
+import numpy as np
+from servobench.controllers.aids import EQUIPPED, AidsConfig
+from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.estimators.constant import ConstantEstimator
+from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
+from servobench.controllers.laws.law import Law
+from servobench.controllers.servo import Servo, ServoController
+
+
+class Transpose(Law[None]):
+    def start(self, observation):
+        return None
+
+    def command(self, state, estimate, observation, reference):
+        e = reference[..., 0, :] - observation.feature
+        return state, np.vecmat(e, estimate.jacobian) / LENGTH
+
+
+def build(config, knowledge):
+    initial = initial_jacobian(config, knowledge)
+    return ServoController(Servo(ConstantEstimator(), Transpose(), initial, knowledge, AidsConfig(**EQUIPPED)))
+
+
+ENTRY = ControllerEntry("transpose", "u = Jᵀ e", InitialConfig, build, side_by_side=True)
+"""
+
+
+def test_parts_that_say_so_are_checked_side_by_side(tmp_path):
+    write(tmp_path, IN_PARTS.replace("LENGTH", "(1.0 + np.sqrt(np.vecdot(e, e)))[..., None]"), "parts.py")
+    assert findings("./parts.py")["side by side"] == ("ok", "")
+    write(tmp_path, IN_PARTS.replace("LENGTH", "(1.0 + np.linalg.norm(e))"), "parts.py")
+    verdict, line = findings("./parts.py")["side by side"]
+    assert verdict == "failed"
+    assert line.startswith("two runs that advance together have other commands than each alone; its parts must be pure")
+    write(
+        tmp_path,
+        f"{CONFIGURED}\n\nENTRY = servobench.ControllerEntry('own', '', MineConfig, Mine, side_by_side=True)\n",
+    )
+    line = "its entry says side_by_side=True, so that build must return a ServoController"
+    assert findings("./mine.py")["side by side"] == ("failed", line)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from kit.command import servobench
-from servobench.harness.cli.main import PANELS, app, command_line
+from servobench.harness.cli.main import PANELS, app, command_line, in_known_number
 from servobench.harness.cli.options import ABSENT, Value, command, named_option
 
 ROOT = command_line()
@@ -120,3 +120,24 @@ def test_one_row_declares_name_help_completion_check_and_absence_of_an_option():
     (declared,) = (each for each in typer.main.get_command(one).params if each.name == "shade")
     assert [each.value for each in declared.shell_complete(None, "r")] == ["red"]
     assert ABSENT["wash", "--colour"] == "no paint"
+
+
+@pytest.mark.parametrize(
+    ("words", "read"),
+    [
+        (
+            ["robustness", "--plants", "kinematic", "--axis=links"],
+            ["robustness", "--plant", "kinematic", "--axes=links"],
+        ),
+        (["run", "--controllers", "constant"], ["run", "--controller", "constant"]),
+        (
+            ["compare", "--seed", "7", "--controller", "constant"],
+            ["compare", "--seeds", "7,", "--controllers", "constant"],
+        ),
+        (["sweep", "--seed=7", "--mismatches", "none"], ["sweep", "--seeds=7,", "--mismatch", "none"]),
+        (["tune", "--robot", "ur5"], ["tune", "--robot", "ur5"]),
+        (["fmu", "export", "--robots", "ur5"], ["fmu", "export", "--robot", "ur5"]),
+    ],
+)
+def test_options_are_taken_in_singular_and_plural(words, read):
+    assert in_known_number(command_line(), words) == read

@@ -17,9 +17,12 @@ def _own_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "check"), [("controller", "check"), ("plant", "check plant")])
-def test_a_new_file_passes_its_own_test(monkeypatch, capsys, tmp_path, kind, check):
-    assert servobench(monkeypatch, "new", kind, "my_law", "--folder", "laws") == 0
+@pytest.mark.parametrize(
+    ("kind", "check", "options"),
+    [("controller", "check", ()), ("controller", "check", ("--aids",)), ("plant", "check plant", ())],
+)
+def test_a_new_file_passes_its_own_test(monkeypatch, capsys, tmp_path, kind, check, options):
+    assert servobench(monkeypatch, "new", kind, "my_law", "--folder", "laws", *options) == 0
     assert f"servobench {check} ./laws/my_law.py" in capsys.readouterr().out
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_law.py"],
@@ -27,6 +30,16 @@ def test_a_new_file_passes_its_own_test(monkeypatch, capsys, tmp_path, kind, che
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert "2 passed" in done.stdout, done.stdout + done.stderr
+
+
+def test_a_new_controller_with_aids_says_so_and_a_plant_has_none(monkeypatch, capsys, tmp_path):
+    assert servobench(monkeypatch, "new", "controller", "my_law", "--aids") == 0
+    assert servobench(monkeypatch, "check", "./my_law.py") == 0
+    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
+    assert ["ok", "aids"] in lines
+    assert servobench(monkeypatch, "new", "plant", "my_cell", "--aids") == 2
+    assert "--aids are those of a controller; leave the option out for a plant" in capsys.readouterr().err
+    assert not (tmp_path / "my_cell.py").exists()
 
 
 def test_nothing_is_overwritten(monkeypatch, capsys, tmp_path):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.folders import comparison, failed_only, made_up_row, sweep
+from servobench.controllers.aids import EQUIPPED
 from servobench.harness.analysis import tables
-from servobench.harness.analysis.folder import describe_folder, describe_settings
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
 from servobench.harness.analysis.verdict import leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import FIGURES
@@ -160,3 +163,17 @@ def test_every_place_that_a_metric_names_exists():
     for metric in METRICS.values():
         assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), metric.column
         assert metric.figure in ("", *FIGURES), metric.column
+
+
+def test_a_folder_says_which_of_its_controllers_have_the_aids(monkeypatch):
+    every = {f"aids.{name}": value for name, value in EQUIPPED.items()}
+    sections = {"ukf_mfac": every, "Mine": {"gain": 2.0}, "ukf_mpc": every | {"aids.limit": "scale"}, "run": {}}
+    manifest = {
+        "controllers": ["ukf_mfac", "Mine", "ukf_mpc", "fmu:a.fmu"],
+        "configuration": sections | {"fmu:a.fmu": {}},
+    }
+    monkeypatch.setattr(results, "read_manifest", lambda _: manifest)
+    wanted = "with all aids: ukf_mfac; without aids: Mine; with all aids but limit: ukf_mpc; aids unknown: fmu:a.fmu"
+    assert describe_controllers(Path()) == wanted
+    manifest["controllers"] = ["Mine"]
+    assert describe_controllers(Path()) == ""

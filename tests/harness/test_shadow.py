@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.broken_controllers import stepping
 from kit.command import servobench
-from servobench import compare
+from servobench import compare, run
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
 from servobench.harness.run.shadow import COMMAND, LOGGED, differences, shadow
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 MOVED = "moderate+camera_move=5deg"
 SECTIONS = {
@@ -112,3 +115,44 @@ def test_what_is_no_log_is_refused(folder, tmp_path):
         logged_in_folder(folder, "other", None)
     with pytest.raises(ConfigurationError, match="must be a results folder, or a table in .csv or .parquet"):
         logged_in_file(tmp_path / "log.txt", "constant", "ur5", "position")
+
+
+JOINTS, FEATURES = "joint_position_", ("feature_x", "feature_y", "feature_z", "reference_")
+SLIPS = {  # name -> begin of the columns, what happens to them, the message; and whether it is a refusal
+    "degrees": (JOINTS, np.degrees, "rad, beyond its range of .*; if the log is in degrees, write it in rad", True),
+    "millimetres": (FEATURES, lambda y: 1000.0 * y, "if the log is in mm, write it in m", True),
+    "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
+    "sign": (JOINTS, np.negative, "move otherwise than this robot's at these joints", False),
+    "kilometres": (FEATURES, lambda y: y / 1000.0, "move otherwise than this robot's at these joints", False),
+    "speeds": (COMMAND, np.degrees, "if they are in deg/s, write them in rad/s", False),
+}
+
+
+@pytest.fixture(scope="module")
+def lap():
+    return run("ukf_mfac", task="circle", settings={"circle": {"laps": 1}}).steps
+
+
+def show(table, path):
+    table.to_csv(path, index=False)
+    return shadow(*logged_in_file(path, "constant", "ur5", "position"))
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_log_in_other_units_is_not_shown_in_silence(lap, tmp_path, caplog, slip):
+    columns, change, message, refused = SLIPS[slip]
+    table, names = lap.copy(), [name for name in lap if name.startswith(columns)]
+    table[names] = change(table[names].to_numpy())
+    remark.cache_clear()
+    if refused:
+        with pytest.raises(ConfigurationError, match=message):
+            show(table, tmp_path / "log.csv")
+        return
+    show(table, tmp_path / "log.csv")
+    assert re.search(message, caplog.text)
+
+
+def test_a_log_of_another_true_robot_and_a_late_camera_is_shown_without_a_remark(tmp_path, caplog):
+    late = {"kinematic": {"sensing": {"latency": 0.2}}, "circle": {"laps": 1}}
+    show(run("ukf_mfac", task="circle", mismatch="severe", settings=late).steps, tmp_path / "log.csv")
+    assert not caplog.text

@@ -192,6 +192,9 @@ def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
         ("joint_upper", "joint_uper", "the key 'joint_upper' is missing"),
         ("convention =", "length = 3\nconvention =", "has no setting 'length'"),
         ("a = [", "a = [[", "is not valid TOML"),
+        ("d = [0.35", "d = [350", "d.0 must be at most 20, got 350; if 350mm is meant, write the unit, too"),
+        ("joint_upper = [", "joint_upper = [170, ", "joint_upper.0 must be at most 30, got 170; if 170deg is meant"),
+        ("joint_speed = [2.0", "joint_speed = [180", "joint_speed.0 must be at most 60, got 180; if 180deg/s is meant"),
         ('"standard"', '"craig"', "convention must be one of standard, modified"),
     ],
 )
@@ -278,3 +281,11 @@ def test_a_drawn_arm_needs_a_number(text):
 def test_the_number_of_a_drawn_arm_has_bounds():
     with pytest.raises(ValueError, match="the number of a random_arm must be from 0 to 1,000,000, got 1000001"):
         random_robot(1_000_001)
+
+
+def test_a_robot_file_takes_units(tmp_path):
+    plain, written = tmp_path / "arm.toml", tmp_path / "units" / "arm.toml"
+    written.parent.mkdir()
+    plain.write_text(FOUR_JOINTS)
+    written.write_text(FOUR_JOINTS.replace("d = [0.35", 'd = ["350mm"'))
+    np.testing.assert_array_equal(find_robot(str(plain)).arm.translation, find_robot(str(written)).arm.translation)

@@ -11,6 +11,7 @@ are those of the coordinate search: each other value of each switch, and 20 % mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -32,7 +33,7 @@ from servobench.harness.studies.tuning.scoring import (
     open_ledger,
     refuse_broken_defaults,
 )
-from servobench.harness.studies.tuning.search import StudyRecord, first_points, neighbours, study
+from servobench.harness.studies.tuning.search import StudyRecord, first_points, neighbours, study, tuned_point
 from servobench.harness.studies.tuning.spaces import (
     Point,
     default_values,
@@ -113,7 +114,9 @@ class Method:
         self.name, self._plan = name, plan
         self.ledger = open_ledger(folder, name, plan.runs)
         self.second = open_ledger(folder, name, plan.runs.second(), SECOND)
-        self._default = nested_settings(default_values(find_tunable(name)))
+        entry = find_tunable(name)
+        self._default = nested_settings(default_values(entry))
+        self._known = [self._default, nested_settings(tuned_point(entry) or default_values(entry))]
         space, first = find_space(name), first_points(name)
         seeds = range(plan.study_seed, plan.study_seed + plan.studies)
         self.studies = [RunningStudy(study(name, space, first, plan.trials, plan.search, seed)) for seed in seeds]
@@ -131,13 +134,16 @@ class Method:
         return [(self.ledger, self.name, each.wanted) for each in self.studies if each.wanted is not None]
 
     def wanted_on_second(self) -> list[Wanted]:
-        """Return the points to score on the second set: the defaults and the results of the studies; none before."""
+        """Return the points to score on the second set, once all studies have ended: their results and known values."""
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
-        points = [self._default, *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
+        points = [*self._known, *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
         return [(self.second, self.name, point) for point in points]
 
     def result(self) -> TunedValues | None:
-        """Return the tuned values; None while a study is not finished or not scored on the second set."""
+        """Return the tuned values; None while a study is not finished or not scored on the second set.
+
+        They are the best ones on the second set: of a study, the defaults, or the values in use so far.
+        """
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
         seconds = [self.second.costs(each.settings) for each in outcomes]
         records = [
@@ -147,8 +153,11 @@ class Method:
         ]
         if len(records) < len(self.studies):
             return None
-        best, runs = min(records, key=lambda record: record.second_score), self._plan.runs
-        mine, theirs = self.ledger.costs(best.settings), self.ledger.costs(self._default)
+        candidates = [*(each.settings for each in records), *self._known]
+        costs = [self.second.costs(each) for each in candidates]
+        mean = [math.inf if each is None else score(each) for each in costs]
+        best, runs = candidates[mean.index(min(mean))], self._plan.runs
+        mine, theirs = self.ledger.costs(best), self.ledger.costs(self._default)
         on_second = self.second.costs(self._default)
         if mine is None or theirs is None or on_second is None:
             return None
@@ -164,13 +173,13 @@ class Method:
             version=version("servobench"),
             score=score(mine),
             score_of_defaults=score(theirs),
-            second_score=best.second_score,
+            second_score=min(mean),
             second_score_of_defaults=score(on_second),
             checked_score=score([mine[i] for i in checked]),
             checked_score_of_defaults=score([theirs[i] for i in checked]),
-            settings=best.settings,
+            settings=best,
             studies=tuple(records),
-            edges=edge_lines(self.name, best.settings),
+            edges=edge_lines(self.name, best),
         )
 
 
@@ -225,7 +234,7 @@ def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, Tuned
 
 @dataclass(frozen=True)
 class TunedValues:
-    """The results of all studies of a method; the best one on the second set is in use."""
+    """The results of all studies of a method, and the values that were best on the second set."""
 
     controller: str
     plants: tuple[str, ...]  # on which the runs took place

@@ -96,7 +96,7 @@ class TuningSet:
 
     plants: tuple[str, ...] = ("kinematic",)
     """names of plants whose latency can be set"""
-    robots: Count = 4
+    robots: Count = 12
     """in each world on each plant"""
     offset: Periods = 0
     """where in the tuning range the seeds begin; it also draws the worlds"""
