@@ -115,6 +115,7 @@ def figures(
     if not files:
         kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
         raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+    results.vouch(folder, files)
     say("\n".join(map(str, files)))
 
 
