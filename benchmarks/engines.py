@@ -23,6 +23,7 @@ from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
@@ -62,7 +63,7 @@ def swings(drives: DriveConfig, robots: int) -> tuple[FloatArray, FloatArray]:
 
 def detections(poses: int) -> FloatArray:
     """Return how far detected balls are from the true ones on both engines, and from each other, (k, 3) m."""
-    model, camera, rng = find_robot("ur5").nominal, RenderedConfig().camera(), np.random.default_rng(FIRST_SEED)
+    model, camera, rng = find_robot("ur5").nominal, CAMERA, np.random.default_rng(FIRST_SEED)
     scenes = [kind(Room(model.arm, False, find_robot("ur5"))) for kind in (BulletScene, MujocoScene)]
     rows = []
     for _ in range(poses):

@@ -28,7 +28,7 @@ from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
-from servobench.plant.robot.camera import view_matrix
+from servobench.plant.robot.camera import CAMERA, view_matrix
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.workspace import BALL_RADIUS
 
@@ -50,7 +50,7 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     stops = np.full(6, np.pi)
     machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))
     mechanics = opened.enter_context(closing(BulletSimulation(machine)))
-    camera = config.camera()
+    camera = CAMERA
     plant.reset(0)
     for scene in scenes:
         scene.place(HOME)
@@ -105,7 +105,7 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     scene = opened.enter_context(closing(MujocoScene(Room(MODEL.arm, config.scenery, ROBOT))))
     simulation.start(HOME)
     scene.place(HOME)
-    camera, world = config.camera(), plant.world
+    camera, world = CAMERA, plant.world
     around = window_around(MODEL.to_camera(scene.ball_position()), BALL_RADIUS, camera)
     if around is None:
         raise RuntimeError("the ball is not in the image")

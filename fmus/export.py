@@ -122,7 +122,7 @@ def fingerprint(options: ExportOptions) -> str:
     """
     view = options.view
     parts: list[object] = [tool(), version("casadi"), version("fmpy"), CODE, options.platforms, options.fmi_version]
-    parts += [options.title, options.identifier, options.summary]
+    parts += [options.title, options.identifier, options.summary, None if view is None else view.size]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]
     digest = hashlib.sha256(repr(parts).encode())

@@ -77,16 +77,18 @@ class View(NamedTuple):
         setup: the set-up.
         mount: of its cameras.
         size: width and height of the images [px].
+        calibrated: whether the cameras have all coefficients of OpenCV's model and two focal lengths.
     """
 
     setup: SensingSetup
     mount: Mount
     size: tuple[float, float]
+    calibrated: bool
 
     @classmethod
     def of(cls, model: SetupModel) -> Self:
         """Return the view of an arm and its cameras."""
-        return cls(model.setup, model.mount, model.optics.size)
+        return cls(model.setup, model.mount, model.optics.size, model.optics.further is not None)
 
     @property
     def word(self) -> str:
@@ -104,6 +106,7 @@ class View(NamedTuple):
         on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
         middle = "Principal point, from the upper left corner of the image."
         turned = f"Roll, pitch and yaw of the cameras in the {on} frame."
+        further = "f_y/f_x, k2, p1, p2, k3 of OpenCV's model, and the largest squared tangent of a visible ray."
         return (
             Group("target", (p, 3), PARAMETER, "m", f"Points of the target in the {off} frame."),
             Group("camera_position", (c, 3), PARAMETER, "m", f"Cameras in the {on} frame."),
@@ -111,6 +114,7 @@ class View(NamedTuple):
             Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
             Group("principal_point", (c, 2), PARAMETER, "px", middle),
             Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
+            *([Group("calibration", (c, 6), PARAMETER, "1", further)] if self.calibrated else []),
         )
 
     def outputs(self, n: int) -> tuple[Group, ...]:
@@ -313,4 +317,5 @@ def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
         "focal_length": optics.focal,
         "principal_point": flat(optics.centre),
         "distortion": optics.distortion,
+        **({} if optics.further is None else {"calibration": flat(optics.further)}),
     }

@@ -72,6 +72,7 @@ SWEEP_COLUMNS: Final = (
     "plant", "mismatch", *(short.column for short in SHORT_NAMES.values()), "sensing", "task", "controller", "status",
     "outcome", "settling_time_s", "task_kind", "rms_error_evaluated", *BAND,
 )  # columns that `sweep_tables` and `outcome_legend` read # fmt: skip
+PAIR: Final = "A − B"  # heading of the first column of paired differences
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 
@@ -172,7 +173,7 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     difference = f"mean difference in {label}" if unit == "1" else f"mean difference in {label} [{unit}]"
     return [
         {
-            "A − B": Cell(f"{first} − {second}"),
+            PAIR: Cell(f"{first} − {second}"),
             "runs lost": Cell("{} : {}".format(*each.lost)),
             difference: Cell(each.mean.scaled(factor), ".2f"),
             "verdict": Cell(each.verdict),

@@ -8,9 +8,10 @@ are not ranked.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,7 +28,13 @@ from servobench.harness.analysis.comparison import (
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.statistics import MIN_PAIRS, is_majority, median_with_interval, paired_difference
+from servobench.harness.analysis.statistics import (
+    MIN_PAIRS,
+    Difference,
+    is_majority,
+    median_with_interval,
+    paired_difference,
+)
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
@@ -35,8 +42,7 @@ from servobench.harness.run.result import COMPLETED
 LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
-BETTER: Final = "faster or more precise"
-NAMED: Final = 3  # controllers that a sentence names
+NAMED, MANY = 3, 6  # controllers that a sentence names at most
 MOST_PLACES: Final = 24  # for which leaders are named
 
 Place = tuple[str, pd.DataFrame]  # words, runs
@@ -63,7 +69,7 @@ def judge(runs: pd.DataFrame) -> Verdict:
     chosen = runs[runs["controller"].isin(ranked)]
     if len(ranked) == 1:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
-    return Verdict(_of_several(chosen, runs), (_doubts(chosen, runs), *cautions))
+    return Verdict(_of_several(chosen, runs), (_doubts(chosen), *cautions))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
@@ -80,19 +86,13 @@ def asked_of(runs: pd.DataFrame) -> str:
     )
 
 
-def leaders(runs: pd.DataFrame, names: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return the leading one of some controllers in each plant, task and condition with its evidence.
+def leaders(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the leading controller in each plant, task and condition with its evidence.
 
-    Without names, of all that do not know the true robot. Empty without a competition. First is the controller with the
-    highest success rate, then the one that has the smallest median settling time, on a curve the smallest median error.
+    Those that know the true robot are left out. Empty without a competition. First is the controller with the highest
+    success rate, then the one that has the smallest median settling time, on a curve the smallest median error.
     """
-    names = ranked_controllers(runs) if names is None else names
-    competitions = [
-        (words, place, own)
-        for words, place in split_conditions(runs)
-        if (own := place[place["controller"].isin(names)])["controller"].nunique() > 1
-    ]
-    return grouped([_leader(*each) for each in competitions] if len(competitions) <= MOST_PLACES else [])
+    return grouped([_leader(*each) for each in _competitions(runs, ranked_controllers(runs))])
 
 
 def judged_metric(place: pd.DataFrame) -> str:
@@ -138,34 +138,77 @@ def _of_several(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
     """Return the result of the runs of ranked controllers; those `beside` include bounds, which set margins."""
     shares = _shares(runs)
     asked, most, least = asked_of(runs), max(shares.values()), min(shares.values())
-    best = [name for name, share in shares.items() if share == most]
+    best, worst = ([name for name, share in shares.items() if share == each] for each in (most, least))
     if most == 0.0:
         return f"None of the {len(shares)} controllers {asked} in any of {len(runs)} runs."
+    winners = _winners(beside, list(shares))
     if most == least:
         everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
-        return f"{everyone} {asked} in {often}{_speed(beside, best)}."
-    worst = [name for name, share in shares.items() if share == least]
+        return f"{winners}{everyone} {asked} in {often}."
     first, last = (_share(runs[runs["controller"] == names[0]]) for names in (best, worst))
-    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}{_speed(beside, best)}"
-    return f"{top}; least often {_listed(worst)}, in {last}."
+    top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}"
+    return f"{winners}{top}; least often {_listed(worst)}, in {last}."
 
 
-def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
-    """Return which of equally reliable controllers is shown to be better than each other one of them."""
-    table = leaders(runs, names) if len(names) > 1 else pd.DataFrame()
-    if table.empty:
-        return ""
-    clear = table["First", "controller"][table["How sure", RIVALS] == NOBODY]
-    if clear.empty:
-        none, others = ("neither", "the other") if len(names) == 2 else ("none of them", "the others")
-        return f", and {none} is shown to be {BETTER} than {others}"
-    best = clear.value_counts().index[0]
-    where = "" if len(table) == 1 else f" in {(clear == best).sum()} of {len(table)} places"
-    return f", of which `{best}` is shown to be the best{where}"
+class _Standing(NamedTuple):
+    """The first of a place and the others in it."""
+
+    where: str
+    equal: tuple[str, ...]  # the first, and all that are shown to be practically equal to it
+    undecided: tuple[str, ...]
+    ahead: tuple[str, ...]  # shown to be better than the first, which has the higher success rate
+    behind: str  # the next that is shown to be worse; empty without one
+    by: float  # mean difference to it [unit]; NaN where it loses more runs
+    metric: str
+    unit: str
+    margin: float  # [unit] that does not matter
 
 
-def _doubts(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
+def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
+    """Return a sentence that names the best of some controllers in each place, and how large the difference is."""
+    known = [_standing(*each) for each in _competitions(runs, names)]
+    if not any(len(each.equal) > 1 or each.behind or each.ahead for each in known):
+        return "Which controller is better is undecided. " if known else ""
+    groups: dict[tuple[object, ...], list[_Standing]] = {}
+    for each in known:
+        groups.setdefault((each.equal, each.undecided, each.ahead, each.behind, each.metric), []).append(each)
+    return "; ".join(_clause(own, len(known)) for own in groups.values()) + ". "
+
+
+def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
+    order, against, metric = *_ranked(place, own), judged_metric(place)
+    unit, factor = shown_unit(metric, place)
+    by_verdict = {
+        verdict: tuple(name for name, each in against.items() if each.verdict == verdict)
+        for verdict in ("equivalent", "undecided", "worse", "better")
+    }
+    behind = next(iter(by_verdict["better"]), "")
+    by = -against[behind].mean.value if behind and not against[behind].lost[1] else math.nan
+    return _Standing(
+        words, (order[0], *by_verdict["equivalent"]), by_verdict["undecided"], by_verdict["worse"], behind, by,
+        metric, unit, factor * margin(metric, place),
+    )  # fmt: skip
+
+
+def _clause(places: Sequence[_Standing], count: int) -> str:
+    """Return the result of places with the same winners, of `count` places in all."""
+    one, label = places[0], METRICS[places[0].metric].label
+    where = f" in {_listed([each.where for each in places], MANY)}" if count > 1 else ""
+    many = len(one.equal) > 1
+    words = f"{_listed(one.equal, MANY)} {'are' if many else 'is'} {'first' if one.undecided else 'best'}{where}"
+    if many:
+        words += f", practically equal (within {max(each.margin for each in places):.2g} {one.unit} in {label})"
+    if one.behind:
+        low, high = (f"{end(each.by for each in places):.2f}" for end in (min, max))
+        size = "by fewer lost runs" if "nan" in (low, high) else f"by {low if low == high else f'{low} to {high}'}"
+        words += f", ahead of `{one.behind}` {size}" + ("" if "lost" in size else f" {one.unit} in {label}")
+    if one.undecided:
+        words += f", undecided against {_listed(one.undecided, MANY)}"
+    return words + (f", though {_listed(one.ahead, MANY)} had less {label}" if one.ahead else "")
+
+
+def _doubts(runs: pd.DataFrame) -> str:
     """Return how far the order of controllers can be trusted."""
     seeds, count = runs["seed"].nunique(), runs["controller"].nunique()
     if seeds < MIN_PAIRS:
@@ -181,39 +224,38 @@ def _doubts(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
     ahead = {name: table[best] - table[name] for name in shares}
     apart = [name for name, each in ahead.items() if is_majority(int((each > 0.0).sum()), int((each < 0.0).sum()))]
     if not apart:
-        sentence = "In how often they did so, no controller can be told apart from the first"
-        alone = list(shares.values()).count(shares[best]) == 1
-        faster = _faster(beside, best, list(shares)) if alone else []
-        tail = f", and {_listed(faster)} {_verb(faster, 'is', 'are')} shown to be {BETTER}" if faster else ""
-        return f"{sentence}{tail}."
-    others = count - 1 - len(apart)
-    return f"Told apart from the first: {_listed(apart, 6)}" + (f"; not so the other {others}." if others else ".")
+        return "The success rates do not differ significantly."
+    less = f"{_listed(apart, MANY)} succeed{'s' if len(apart) == 1 else ''} significantly less often than `{best}`"
+    return f"{less} (sign test over seeds)."
 
 
-def _faster(runs: pd.DataFrame, best: str, names: Sequence[str]) -> list[str]:
-    """Return which of some controllers are shown to be faster or more precise than `best` in every place."""
+def _competitions(runs: pd.DataFrame, names: Sequence[str]) -> list[tuple[str, pd.DataFrame, pd.DataFrame]]:
+    """Return each place with more than one of some controllers: words, its runs, and those of these controllers."""
     places = split_conditions(runs)
-    if len(places) > MOST_PLACES:
-        return []
-    found = [_verdicts(place, [(name, best) for name in names]) for _, place in places]
-    return [name for name, told in zip(names, zip(*found, strict=True), strict=True) if set(told) == {"better"}]
+    alone = len(places) == runs["task"].nunique()
+    found = [
+        (str(place["task"].iloc[0]) if alone else words, place, own)
+        for words, place in places
+        if (own := place[place["controller"].isin(names)])["controller"].nunique() > 1
+    ]
+    return found if len(found) <= MOST_PLACES else []
 
 
-def _verdicts(place: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return how the first of each pair does beside the second in a place, on the seeds that both have run."""
-    table, metric = judged_values(place), judged_metric(place)
-    table = table.reindex(columns=sorted({name for pair in pairs for name in pair}))
-    known, small = [table[list(pair)].dropna() for pair in pairs], shown_unit(metric, place)[1] * margin(metric, place)
-    return [paired_difference(each.iloc[:, 0], each.iloc[:, 1], small).verdict for each in known]
+def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str, Difference]]:
+    """Return the controllers of a place, best first, and how the first one differs from each other one."""
+    table, shares = judged_values(place), _shares(own)
+    order = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
+    small = shown_unit(judged_metric(place), place)[1] * margin(judged_metric(place), place)
+    pairs = {name: table[[order[0], name]].dropna() for name in order[1:]}
+    return order, {name: paired_difference(each.iloc[:, 0], each.iloc[:, 1], small) for name, each in pairs.items()}
 
 
 def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
     table, metric, shares = judged_values(place), judged_metric(place), _shares(own)
     unit, _ = shown_unit(metric, place)
-    order = sorted(shares, key=lambda name: (-shares[name], table[name].median()))
+    order, against = _ranked(place, own)
     first, second = order[:2]
-    told = _verdicts(place, [(first, name) for name in order[1:]])
-    rivals = [name for name, verdict in zip(order[1:], told, strict=True) if verdict != "better"]
+    rivals = [name for name, each in against.items() if each.verdict != "better"]
 
     def median(name: str) -> str:
         value, *interval = f"{median_with_interval(table[name]):.{METRICS[metric].digits}f}".split(" ", 1)

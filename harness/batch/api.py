@@ -68,7 +68,8 @@ def run(
             `PlantEntry`.
         task: name of a task, or a place such as "./spiral.py" or "./spiral.py:Spiral".
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
-        robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF.
+        robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF;
+            with the file of your camera "ur10e with my_camera.toml".
         sensing: set-up such as "pixel", "stereo:hand" or "./polar.py", where the plant has it.
         seed: of everything random in the run.
         settings: section -> key -> value, such as {"kinematic": {"lag": 0.1}}.

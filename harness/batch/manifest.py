@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +20,7 @@ from servobench.harness.config.source import PLACE, digest_of_module, neighbours
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.robot.catalogue import WITH
 from servobench.plant.robot.mismatch import Mismatch
 
 PACKAGES = (
@@ -117,7 +119,8 @@ def describe_robot(name: str) -> dict[str, Any]:
         "workspace_centre_m": work.centre,
     }
     listed = {key: value.tolist() for key, value in numbers.items()}
-    return {"name": name, "title": robot.title, "source": robot.source, "note": robot.note, **listed}
+    camera = {} if robot.camera is None else {"camera": asdict(robot.camera.keys)}
+    return {"name": name, "title": robot.title, "source": robot.source, "note": robot.note, **listed, **camera}
 
 
 MAPPING: Final = ".toml"
@@ -146,7 +149,9 @@ def named_files(
 
 def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
-    yield from (name.partition("#")[0] for name in runs.robots)
+    yield from (name.partition(WITH)[0].partition("#")[0] for name in runs.robots)
+    for camera in (find_robot(name).camera for name in runs.robots):
+        yield from () if camera is None else map(str, camera.files)
     yield from filter(None, (Mismatch.parse(text).calibration for text in runs.mismatches))
     for values in configuration.values():
         yield from (str(value) for key, value in values.items() if key.split(".")[-1] == SETTING and value)

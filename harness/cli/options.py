@@ -88,18 +88,25 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     rows: list[tuple[str, Any, Any]] = []
+    camera = [("camera", None, CameraOption)] if (function.__name__, "--camera") not in ABSENT else []
     for name, parameter in signature(function).parameters.items():
+        rows += camera if name == "robot" else []
         if name not in groups:
             rows.append((name, parameter.default, hints[name]))
             continue
         types = get_type_hints(groups[name], include_extras=True)
         given = {} if parameter.default is Parameter.empty else vars(parameter.default)
         rows += [(each.name, given.get(each.name, each.default), types[each.name]) for each in fields(groups[name])]
+        rows += camera if "robot" in types else []
 
     @wraps(function)
     def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
         from servobench.harness.config.registry import offering
 
+        if (camera := values.pop("camera", None)) is not None:
+            from servobench.harness.config.robots import DEFAULT_ROBOT, with_camera
+
+            values["robot"] = with_camera(values["robot"] or DEFAULT_ROBOT, camera)
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
         with offering():  # a user's own controllers have their names for as long as the command takes
@@ -126,6 +133,21 @@ RobotOption = Annotated[
             "claims": "the claims are those of the paper, which are about a UR5",
             "suite": "challenges are graded on the UR5; compare and sweep take other arms",
             "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+        },
+    ),
+]
+CameraOption = Annotated[  # of every command that has --robot
+    Path | None,
+    named_option(
+        "--camera",
+        "FILE",
+        "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's.",
+        absent={
+            "claims": "the claims are those of the paper, which are about the bench's camera",
+            "suite": "a challenge names its camera in its file; compare and sweep take any",
+            "analyse": "its loops are those of the ball in 3-D before the bench's camera",
+            "tune": "methods are tuned with the bench's camera, and others take these settings; compare shows how they "
+            "do",
         },
     ),
 ]

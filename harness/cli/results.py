@@ -33,6 +33,9 @@ def statistics(
         ),
     ] = None,
     markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
+    latex: Annotated[
+        bool, named_option("--latex", "", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Judge the controllers of a folder, with intervals.
@@ -42,8 +45,8 @@ def statistics(
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
-    if markdown and as_json:
-        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+    if markdown + latex + as_json > 1:
+        raise ConfigurationError("--markdown, --latex and --json are ways to print the same; give one of them")
     runs = results.load_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
@@ -56,8 +59,13 @@ def statistics(
         )
         return
     if missing:
-        say(missing)
+        say(f"% {missing}" if latex else missing)
     tables = statistics_tables(runs, metric)
+    if latex:
+        from servobench.harness.analysis.paper import latex_tables, methods_paragraph
+
+        say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
+        return
     print_markdown(tables) if markdown else print_tables(tables)
     say_aids(folder)
 
@@ -78,7 +86,7 @@ def figures(
     kind: Annotated[str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")] = "all",
     controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
     names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
-    width: Annotated[str, option("LENGTH", "Width, such as 3.5in, 8.9cm or 89mm, of a column of a paper.")] = "7.2in",
+    width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 3.5in, 89mm or 252pt.")] = "7.2in",
     title: Annotated[bool, named_option("--title/--no-title", "", "Write what it shows above each figure.")] = True,
     format_: Annotated[
         str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
 from servobench.harness.config.source import PLACE, SourceFile
@@ -32,6 +33,17 @@ def find_robot(name: str) -> Robot:
         return catalogue.find_robot(name)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
+
+
+def with_camera(robot: str, camera: Path) -> str:
+    """Return the word for a robot with the camera of a file in place of the bench's.
+
+    Raises:
+        ConfigurationError: a robot or a file that cannot be used.
+    """
+    word = f"{robot}{catalogue.WITH}{camera}"
+    find_robot(word)
+    return word
 
 
 def sensing_names() -> list[str]:

@@ -37,8 +37,10 @@ TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
 FORMATS = ("png", "pdf")
 ALL_FORMATS: Final = (*FORMATS, "svg", "pgf")
-INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4}  # unit -> how many of it are an inch
+INCHES: Final = {"in": 1.0, "cm": 2.54, "mm": 25.4, "pt": 72.27}  # unit -> how many of it are an inch
 TWO_COLUMNS: Final = 5.0  # [in] from which on panels stand beside each other
+PGF_TEXT: Final = re.compile(r"(?<=\\def%\{\\%\}).*(?=\}\}%$)", re.MULTILINE)
+UNDERSCORE: Final = re.compile(r"(\$[^$]*\$)|(?<!\\)_")  # outside of formulas
 TEX: Final = ("pdflatex", "lualatex", "xelatex")  # programs with which pgf measures its text
 UNDATED: Final[dict[str, Any]] = {
     "pdf": {"metadata": {"CreationDate": None}},
@@ -90,7 +92,7 @@ class Layout:
         number, unit = split_quantity(text) or (math.nan, "")
         width = number / INCHES.get(unit, math.nan)
         if not 2.0 <= width <= 20.0:
-            raise ConfigurationError(f"--width must be from 2in to 20in, as 3.5in, 8.9cm or 89mm, got {text}")
+            raise ConfigurationError(f"--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got {text}")
         return cls(width, WIDE.columns if width >= TWO_COLUMNS else 1, WIDE.pixels, WIDE.density)
 
     @property
@@ -316,6 +318,11 @@ def save_figure(
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
         with figure_style(TEXT):
             figure.savefig(paths[-1], dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
+        if ending == "pgf":  # without a package for underscores
+            text = PGF_TEXT.sub(
+                lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), paths[-1].read_text()
+            )
+            paths[-1].write_text(text)
         figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
     return paths
 

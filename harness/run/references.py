@@ -6,6 +6,9 @@ curve in space moves the target as the ball of `position` would move in the firs
 that the target has at home, and nearer by as much as the camera is nearer:
 
     p_j(t) = X_MC (ρ y(t)) + p_j(home) − p̄(home)       p̄ mean of the points, ρ ratio of the distances, y(t) the curve
+
+For a user's camera the curve is about the middle of the workspace as that camera sees it, or before a camera on the
+hand about the target at home; ρ is at most 1, and smaller by as much as less of the workspace is in the image.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.files import reason
 from servobench.plant.contract.signals import Channel
+from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.robot import Robot
 
 TaskKind: TypeAlias = Literal["point_to_point", "curve"]
@@ -190,5 +194,16 @@ class FollowedCurve(ImageReference):
         """Return the place at each time."""
         home = self.model.points(self.robot.workspace.home)
         ratio, pose = self.model.distance / self.robot.workspace.camera_distance, self.model.camera
-        place = np.matvec(pose[:3, :3], ratio * self.curve.at(time)) + pose[:3, 3]
+        curve = ratio * self.curve.at(time) if self.robot.camera is None else self._in_own_image(ratio, time)
+        place = np.matvec(pose[:3, :3], curve) + pose[:3, 3]
         return np.asarray(place[..., None, :] + (home - home.mean(axis=-2)))
+
+    def _in_own_image(self, ratio: float, time: npt.ArrayLike) -> FloatArray:
+        """Return the curve in the frame of a user's camera, (..., 3) m, given the ratio of the distances."""
+        work, image, pose = self.robot.workspace, self.robot.pinhole, self.robot.camera_pose
+        middle = work.centre
+        if self.model.mount == "hand":
+            middle, pose = self.model.points(work.home).mean(axis=-2), self.model.camera
+        seen = min(image.width, image.height) / image.focal * CAMERA.focal / CAMERA.height
+        about = self.curve.at(time) - (0.0, 0.0, work.camera_distance)
+        return np.asarray(min(1.0, ratio * seen) * about + (middle - pose[:3, 3]) @ pose[:3, :3])

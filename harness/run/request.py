@@ -18,6 +18,7 @@ from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.contract.units import in_own_unit, split_quantity
+from servobench.plant.robot.catalogue import WITH
 from servobench.plant.robot.mismatch import Mismatch
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
@@ -171,7 +172,8 @@ class RunRequest:
             _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller, self.task)
         )
         varied = "".join(map(_in_name, self.varied)) if self.varied else ""
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files(Path(self.robot).name)}-"
+        parts = (Path(part).name for part in self.robot.split(WITH))
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files('+'.join(parts))}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{_fit_for_files(Path(self.sensing).name)}-"
         return f"{plant}-{robot}{sensing}{controller}-{task}-{mismatch}{varied}-{self.seed}"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from servobench.harness.config.registry import (
@@ -88,10 +88,10 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
                 raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
         if request.plant == request.controller:
             raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
-    robot = _common_robot(requests)
+    robot, period = _common_robot(requests), settings.resolve("run", RunSettings()).period
     find = installed_plant if to_run else find_plant
     defaults |= {
-        name: _plant_default(name, find(name), robot) for name in dict.fromkeys(each.plant for each in requests)
+        name: _plant_default(find(name), robot, period) for name in dict.fromkeys(each.plant for each in requests)
     }
     defaults |= {
         name: default_config(find_controller(name), model_known=robot.known)
@@ -109,10 +109,17 @@ def _common_robot(requests: Iterable[RunRequest]) -> Robot:
     return find_robot(names[0])
 
 
-def _plant_default(name: str, entry: PlantEntry, robot: Robot) -> Any:  # noqa: ANN401 - any configuration dataclass
+def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass
+    name, camera = entry.name, robot.camera
     if entry.own_robot and robot.name != DEFAULT_ROBOT:
         raise ConfigurationError(f"plant {name} brings a robot of its own, so --robot {robot.name} does not apply")
-    return entry.config() if entry.config_for is None else entry.config_for(robot)
+    if camera is not None and (entry.own_robot or not entry.any_sensing):
+        raise ConfigurationError(f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply")
+    config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
+    try:
+        return config if camera is None else replace(config, sensing=camera.sensing(config.sensing, period))
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
 
 
 def select(request: RunRequest, sections: Sections) -> ResolvedRun:

@@ -36,6 +36,7 @@ from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings
+from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.inverse import reach_pose
 from servobench.plant.robot.robot import Robot
 
@@ -128,7 +129,8 @@ def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt
     """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
     points = nominal.points(postures)
     planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1) & (nominal.incidence(points) >= FACING)
-    return np.asarray(planned & true.valid_at(true.points(postures), TRUE_SHARE).all(axis=-1))
+    share = TRUE_SHARE if nominal.planned == CAMERA else PLANNED_SHARE  # marks may be larger in a user's image
+    return np.asarray(planned & true.valid_at(true.points(postures), share).all(axis=-1))
 
 
 @settings

@@ -7,6 +7,7 @@
                        the first `reference_seeds` robots, or on all
     [settings]         further settings, SECTION.KEY = VALUE, of the sections run, plant and task
     plants             those on which it is carried out unless a user names others
+    camera             a file beside this one with the camera of a user, in place of the bench's
     [grade]            name, date and the mean scores of the methods that gave it, written once
 
 Grade I: all equipped methods pass. II: the best and the worst of them differ by a factor of three or by 30 points of
@@ -19,12 +20,14 @@ from __future__ import annotations
 import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.robots import DEFAULT_ROBOT, with_camera
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import SHORT_NAMES
@@ -95,6 +98,7 @@ class Challenge:
     measure: Literal["settling", "path"] = "settling"
     reference: Names = ()
     plants: Names = ("kinematic", "fmu")
+    camera: str = ""
     period: Positive | None = None
     latency: NonNegative | None = None
     noise: NonNegative | None = None
@@ -117,10 +121,12 @@ class Challenge:
         varied = tuple((short | flatten(self.settings)).items())
         methods = tuple(name for name in controllers if name not in self.reference)
         robots = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
+        arm = with_camera(DEFAULT_ROBOT, Path(self.camera)) if self.camera else DEFAULT_ROBOT
+        world = partial(Batch, tuple(plants) or self.plants, tasks=(self.task,), mismatches=(self.mismatch,), robot=arm)
         return [
             Cell(replace(request, varied=varied))
             for names, own in robots.items()
-            for request in Batch(tuple(plants) or self.plants, names, (self.task,), (self.mismatch,), own).requests()
+            for request in world(names, seeds=own).requests()
         ]
 
     def check(self) -> None:
@@ -184,6 +190,7 @@ def find_challenge(word: str) -> Challenge:
         raise ConfigurationError(str(error)) from error
     try:
         values["task"] = choose_task(values.get("task", ""))
+        values |= {"camera": str(path.parent / values["camera"])} if "camera" in values else {}
         challenge = override("challenge", Challenge(path.stem), values)
         challenge.check()
     except ValueError as error:

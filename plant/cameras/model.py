@@ -25,6 +25,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray, Channel
 from servobench.plant.robot.arm import YZX, ZXY, SerialArm
+from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import RobotModel
 
 Mount: TypeAlias = Literal["fixed", "hand"]
@@ -45,7 +46,7 @@ class SetupModel(RobotModel):
         optics: their intrinsics.
         target: (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
         distance: from the cameras to the target in the middle of the workspace, as planned [m].
-        focal: of a camera as planned, which decides the natural size of a feature [px].
+        planned: image of a camera as planned, whose focal length decides the natural size of a feature.
         far: distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m].
     """
 
@@ -56,18 +57,18 @@ class SetupModel(RobotModel):
     optics: Optics
     target: FloatArray
     distance: float
-    focal: float
+    planned: PinholeCamera
     far: float
 
     @cached_property
     def channel(self) -> Channel:
         """Names, unit and natural size of the features."""
-        return self.setup.channel(self.focal, self.distance)
+        return self.setup.channel(self.planned.focal, self.distance)
 
     @property
     def noise_unit(self) -> float:
         """A metre of noise in the unit of the features; pixels have the same noise at every distance."""
-        return self.setup.scale(self.focal, self.far)
+        return self.setup.scale(self.planned.focal, self.far)
 
     @property
     def camera(self) -> FloatArray:

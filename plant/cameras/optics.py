@@ -1,11 +1,18 @@
-"""Cameras as optics: a pinhole with radial distortion, its derivative, and the limits of the image.
+"""Cameras as optics: a pinhole with distortion, its derivative, and the limits of the image.
 
 With p = (x, y, z) in the camera frame, z along the optical axis, x right and y down in the image,
 
     a = (x, y) / z,   r² = ‖a‖²,   (u, v) = c + f (1 + k r²) a
 
 f [px] is the focal length, c [px] the principal point, counted from the image's upper left corner, and k [1] the first
-coefficient of radial distortion, as in OpenCV. All functions take leading axes.
+coefficient of radial distortion, as in OpenCV. A calibrated camera has all five coefficients of OpenCV's model and a
+focal length for each axis:
+
+    (u, v) = c + (f_x b_x, f_y b_y)
+    b = (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) a + (2 p₁ a_x a_y + p₂ (r² + 2 a_x²), p₁ (r² + 2 a_y²) + 2 p₂ a_x a_y)
+
+Beyond the r at which the radial polynomial turns back, a point would appear a second time: it is not in the image. All
+functions take leading axes.
 """
 
 from __future__ import annotations
@@ -20,7 +27,6 @@ from servobench.plant.contract.lanes import norm, outer
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
-CAMERA: Final = PinholeCamera()  # planned camera of every set-up in pixels
 NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
@@ -30,16 +36,24 @@ class Optics:
     """The intrinsics of c cameras.
 
     Attributes:
-        focal: f, (..., c) [px].
+        focal: f or f_x, (..., c) [px].
         centre: c, (..., c, 2) [px].
-        distortion: k, (..., c) [1].
+        distortion: k or k₁, (..., c) [1].
         size: width and height of the images [px].
+        further: f_y/f_x, k₂, p₁, p₂, k₃ and the largest r², (..., c, 6) [1], of calibrated cameras; None of others.
     """
 
     focal: FloatArray
     centre: FloatArray
     distortion: FloatArray
     size: tuple[float, float]
+    further: FloatArray | None = None
+
+    @property
+    def focal_lengths(self) -> FloatArray:
+        """Focal lengths of both axes, (..., c, 2) [px]."""
+        aspect = np.ones_like(self.focal) if self.further is None else self.further[..., 0]
+        return np.stack([self.focal, self.focal * aspect], axis=-1)
 
 
 def ideal_optics(camera: PinholeCamera, count: int) -> Optics:
@@ -60,6 +74,10 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
         (..., c, p, 2) [px].
     """
     a = points[..., :2] / _depth(points)
+    if optics.further is not None:
+        return optics.centre[..., None, :] + optics.focal_lengths[..., None, :] * _bent(
+            a, optics.distortion, optics.further
+        )
     stretch = 1.0 + optics.distortion[..., None] * (a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1])
     return optics.centre[..., None, :] + (optics.focal[..., None] * stretch)[..., None] * a
 
@@ -75,6 +93,10 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
     depth = _depth(points)
     a, k = points[..., :2] / depth, optics.distortion[..., None, None, None]
     flat = (motions[..., :2, :] - a[..., None] * motions[..., 2:, :]) / depth[..., None]
+    if optics.further is not None:
+        return np.asarray(
+            optics.focal_lengths[..., None, :, None] * (_slope(a, optics.distortion, optics.further) @ flat)
+        )
     square = np.vecdot(a, a)[..., None, None]
     bent = flat + k * (square * flat + 2.0 * (outer(a, a) @ flat))
     return np.asarray(optics.focal[..., None, None, None] * bent)
@@ -90,8 +112,12 @@ def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
         depth: z, (..., c, p) [m].
         optics: of the cameras.
     """
-    bent = (pixels - optics.centre[..., None, :]) / optics.focal[..., None, None]
-    a = _undistorted(bent, optics.distortion[..., None]) if optics.distortion.any() else bent
+    bent = (pixels - optics.centre[..., None, :]) / optics.focal_lengths[..., None, :]
+    a = bent
+    if optics.further is not None:
+        a = _straightened(bent, optics.distortion, optics.further)
+    elif optics.distortion.any():
+        a = _undistorted(bent, optics.distortion[..., None])
     z = depth[..., None]
     across = a * z
     return np.concatenate([across, np.broadcast_to(z, (*across.shape[:-1], 1))], axis=-1)
@@ -108,6 +134,44 @@ def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
     return np.asarray(bent * (r / np.maximum(wanted, 1e-12))[..., None])
 
 
+def _radial(a: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatArray, ...]:
+    """Return r², 1 + k₁ r² + k₂ r⁴ + k₃ r⁶, its derivative by r², (..., c, p) each, and p₁ and p₂, (..., c, 1)."""
+    k1, (k2, p1, p2, k3) = k1[..., None], (further[..., i, None] for i in range(1, 5))
+    s = a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
+    return s, 1.0 + s * (k1 + s * (k2 + s * k3)), k1 + s * (2.0 * k2 + 3.0 * s * k3), p1, p2
+
+
+def _bent(a: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
+    """Return b, (..., c, p, 2), of calibrated cameras."""
+    s, stretch, _, p1, p2 = _radial(a, k1, further)
+    x, y = a[..., 0], a[..., 1]
+    across = 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x), p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([stretch * x + across[0], stretch * y + across[1]], axis=-1)
+
+
+def _slope(a: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
+    """Return ∂b/∂a, (..., c, p, 2, 2), of calibrated cameras."""
+    _, stretch, change, p1, p2 = _radial(a, k1, further)
+    x, y = a[..., 0], a[..., 1]
+    xx = stretch + 2.0 * x * x * change + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = 2.0 * x * y * change + 2.0 * p1 * x + 2.0 * p2 * y
+    yy = stretch + 2.0 * y * y * change + 6.0 * p1 * y + 2.0 * p2 * x
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+
+
+def _straightened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
+    """Return a, (..., c, p, 2), of which b are the bent ones; Newton's method within the part that is visible."""
+    a, most = b, 0.95 * np.sqrt(further[..., 5, None])
+    for _ in range(NEWTON_STEPS):
+        slope = _slope(a, k1, further)
+        (xx, xy), (_, yy) = np.moveaxis(slope, (-2, -1), (0, 1))
+        e = _bent(a, k1, further) - b
+        step = np.stack([yy * e[..., 0] - xy * e[..., 1], xx * e[..., 1] - xy * e[..., 0]], axis=-1)
+        a = a - step / np.maximum(xx * yy - xy * xy, 1e-2)[..., None]
+        a = a * np.minimum(1.0, most / np.maximum(norm(a), 1e-12))[..., None]
+    return np.asarray(a)
+
+
 def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArray:
     """Return which points, (..., c, p, 3) m, are in front of the camera and in the image, (..., c, p).
 
@@ -118,6 +182,9 @@ def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArra
     """
     half = 0.5 * np.array(optics.size)
     inside = (np.abs(project(points, optics) - half) <= share * half).all(axis=-1)
+    if optics.further is not None:
+        a = points[..., :2] / _depth(points)
+        inside &= np.vecdot(a, a) <= optics.further[..., 5, None]
     return np.asarray(inside & (points[..., 2] > NEAR))
 
 

@@ -12,6 +12,9 @@ radial distortions set, each drawn uniformly from plus or minus the magnitude. A
 own centre as well, by an angle drawn below `mount` about a random axis. Every further camera of a set-up turns as the
 first one does (`camera_rotation`), by draws of its own. Every axis has a random stream of its own; a camera has the
 same draws in every set-up.
+
+A camera of the user's is where its file says, and its deviations are drawn on top of the file. Its target, where the
+file does not place it, is on its optical axis with the arm at home, if it is on the hand.
 """
 
 from __future__ import annotations
@@ -25,11 +28,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from servobench.plant.cameras.model import Mount, SetupModel
-from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics
+from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.camera_file import OwnCamera, turning_point
 from servobench.plant.robot.hand_eye import turn_about
 from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
@@ -108,7 +112,35 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.n < setup.least_joints:
         wanted = f"an arm of {setup.least_joints} joints or more"
         raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
-    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned_draws(setup.cameras))
+    if robot.camera is not None:
+        _check_fit(robot.camera, setup, mount)
+    draws = planned_draws(setup.cameras)
+    model = _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), draws)
+    home = robot.workspace.home
+    if robot.camera is not None and not (model.distance > NEAR and model.valid_at(model.points(home)).all()):
+        where = [[round(value, 3) for value in point] for point in model.point_motions(home)[0][0].tolist()]
+        raise ValueError(
+            f"camera {robot.camera.name} does not see the target with the arm at home: the target is at "
+            f"{where} m in the camera's frame (x right, y down, z ahead); wanted another pose, mount or target"
+        )
+    return model
+
+
+def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
+    """Refuse a user's camera that cannot be that of a set-up."""
+    name, on, off = camera.name, "base", "flange"
+    if mount == "hand":
+        on, off = off, on
+    if camera.keys.pose.frame == off:
+        other = setup.name if mount == "hand" else f"{setup.name}:hand"
+        raise ValueError(f"camera {name} is on the {off}; use --sensing {other}")
+    if camera.keys.target.frame == on:
+        raise ValueError(f"camera {name}: the target must be on the {off} where the camera is on the {on}")
+    if (camera.second is None) != (setup.cameras == 1):
+        raise ValueError(
+            f"sensing {setup.name} has {setup.cameras} cameras, and {name} describes {2 - (camera.second is None)}; "
+            'name the file of the other one, second = "FILE", where there are two'
+        )
 
 
 def true_model(
@@ -145,7 +177,9 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
     """
     if setup.cameras not in (1, 2):
         raise ValueError(f"{setup.name} needs {setup.cameras} cameras, and there are places for one or two")
-    work = robot.workspace
+    work, own = robot.workspace, robot.camera
+    if own is not None and own.keys.pose.frame:
+        return np.stack([each.keys.pose.matrix for each in (own, own.second)[: setup.cameras] if each is not None])
     if mount == "fixed":
         above, distance = work.camera_pose()[:3, :3], setup.closeness * work.camera_distance
         front = Rotation.from_euler("y", SIDE).as_matrix() @ above
@@ -164,16 +198,44 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
 def _model(
     setup: SensingSetup, mount: Mount, robot: Robot, arm: SerialArm, cameras: FloatArray, draws: CameraDraws
 ) -> SetupModel:
-    work = robot.workspace
-    optics = ideal_optics(CAMERA, setup.cameras)
-    optics = Optics(optics.focal * draws.focal, optics.centre + draws.centre, draws.distortion, optics.size)
-    home = robot.arm.frames(work.home)[-1]
-    shape = work.scale * np.array(setup.target)
+    work, own = robot.workspace, robot.camera
+    home, far = robot.arm.frames(work.home)[-1], work.camera_distance
+    shape = _shape(setup, robot)
     if mount == "fixed":
-        R_FC = home[:3, :3].T @ work.camera_pose()[:3, :3]
-        target, distance = arm.tool + shape @ R_FC.T, setup.closeness * work.camera_distance
+        distance = setup.closeness * far
+        if own is not None:
+            distance = float((work.centre - robot.camera_pose[:3, 3]) @ robot.camera_pose[:3, 2])
+        target = arm.tool + shape @ (home[:3, :3].T @ robot.camera_pose[:3, :3]).T
     else:
         distance = HAND_DISTANCE * work.scale
         ahead = robot.arm.tool + np.array([0.0, 0.0, distance])
+        if own is not None:
+            pose = planned_cameras(setup, mount, robot)[0]
+            shape, ahead = shape @ pose[:3, :3].T, pose[:3, 3] + distance * pose[:3, 2]
+            if own.keys.target.frame:
+                ahead = (np.array(own.keys.target.position) - home[:3, 3]) @ home[:3, :3]
+                distance = float((ahead - pose[:3, 3]) @ pose[:3, 2])
         target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
-    return SetupModel(arm, setup, mount, cameras, optics, target, distance, CAMERA.focal, work.camera_distance)
+    return SetupModel(arm, setup, mount, cameras, _optics(setup, robot, draws), target, distance, robot.pinhole, far)
+
+
+def _shape(setup: SensingSetup, robot: Robot) -> FloatArray:
+    """Return the points of the target about its middle, (p, 3) m."""
+    side = None if robot.camera is None else robot.camera.keys.target.side
+    points = np.array(setup.target)
+    return robot.workspace.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))
+
+
+def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
+    """Return the intrinsics of the cameras as drawn; those of depth are rectified."""
+    optics = ideal_optics(robot.pinhole, setup.cameras)
+    focal, centre, distortion, further = optics.focal, optics.centre, draws.distortion, None
+    if robot.camera is not None and setup.unit == "px":
+        own = [each for each in (robot.camera, robot.camera.second) if each is not None]
+        K, D = np.array([each.matrix for each in own]), np.array([each.distortion for each in own])
+        focal, centre, distortion = K[:, 0, 0], K[:, :2, 2], D[:, 0] + distortion
+        further = np.column_stack([K[:, 1, 1] / K[:, 0, 0], D[:, 1:], distortion])
+        further[:, 5] = [turning_point(k1, k2, k3) for k1, k2, k3 in zip(distortion, D[:, 1], D[:, 4], strict=True)]
+        if (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all():
+            further = None
+    return Optics(focal * draws.focal, centre + draws.centre, distortion, optics.size, further)

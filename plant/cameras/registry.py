@@ -47,10 +47,9 @@ class Sensing:
         """Return the word, as it stands in the column `sensing`; fixed cameras are not named."""
         return self.setup.name if self.mount == FIXED else f"{self.setup.name}:{self.mount}"
 
-    @property
-    def plain(self) -> bool:
-        """Whether it is the ball in 3-D by a fixed camera, for which the arm's own model serves."""
-        return self == Sensing()
+    def _is_plain(self, robot: Robot) -> bool:
+        """Return whether it is the ball in 3-D by the bench's fixed camera, for which the arm's own model serves."""
+        return self == Sensing() and robot.camera is None
 
     def nominal(self, robot: Robot) -> RobotModel:
         """Return the nominal robot under this sensing, as planned, which controllers may know.
@@ -58,7 +57,7 @@ class Sensing:
         Raises:
             ValueError: the arm has too few joints for the set-up.
         """
-        return robot.nominal if self.plain else nominal_model(self.setup, self.mount, robot)
+        return robot.nominal if self._is_plain(robot) else nominal_model(self.setup, self.mount, robot)
 
     def true(
         self, robot: Robot, true: HandEyeModel, sample: MismatchSample, mismatch: Mismatch, seed: int
@@ -76,7 +75,7 @@ class Sensing:
             ValueError: the arm has too few joints, or the mismatch names an axis that the cameras do not have.
         """
         self._check(mismatch)
-        if self.plain:
+        if self._is_plain(robot):
             return true, None
         draws = draw_cameras(mismatch, self.setup.cameras, seed)
         turn = sample.camera_angle * sample.camera_axis

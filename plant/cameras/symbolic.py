@@ -17,10 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
-from servobench.plant.cameras.optics import CAMERA, NEAR, Optics, ideal_optics, project
+from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics, project
 from servobench.plant.cameras.setups import POSITION, SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 
 Expressions: TypeAlias = npt.NDArray[Any]
@@ -149,10 +150,13 @@ def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> 
     """Return which features of points (1, c, p, 3) are valid, (m, 1) of ones and zeros; see `SetupModel.valid_at`."""
     pixels, half = project(points, optics)[0], 0.5 * np.array(optics.size)
     seen = []
-    for points_of_camera, pixels_of_camera in zip(points[0], pixels, strict=True):
+    for camera, (points_of_camera, pixels_of_camera) in enumerate(zip(points[0], pixels, strict=True)):
         front = _shows_front(points_of_camera)
         for point, pixel in zip(points_of_camera, pixels_of_camera, strict=True):
             inside = [casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)]
+            if optics.further is not None:
+                far = optics.further[camera, 5] * casadi.fmax(point[2], NEAR) ** 2
+                inside[0] = casadi.logic_and(inside[0], point[0] ** 2 + point[1] ** 2 <= far)
             seen.append(casadi.logic_and(casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)))
     if setup.single:
         return casadi.vertcat(*(each for each in seen for _ in range(setup.m // len(seen))))

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.cameras.model import SetupModel
-from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics, locate
+from servobench.plant.cameras.optics import Optics, ideal_optics, locate
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
@@ -43,7 +43,7 @@ from servobench.plant.rendered.detection import (
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
@@ -70,14 +70,16 @@ class Lens:
             camera: the number of this one.
         """
         this = slice(camera, camera + 1)
-        own = Optics(optics.focal[this], optics.centre[this], optics.distortion[this], optics.size)
+        further = None if optics.further is None else optics.further[this]
+        own = Optics(optics.focal[this], optics.centre[this], optics.distortion[this], optics.size, further)
         self._ideal = planned
         self._map: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None = None
         if as_planned(own, planned):
             return
         rays = _rays(planned, own)
         half = np.abs(rays[:, :2]).max(axis=0) * own.focal[0] + 2.0
-        width, height = (min(MAX_SIZE, 2 * math.ceil(size)) for size in half.tolist())
+        largest = max(MAX_SIZE, 2 * planned.width)
+        width, height = (min(largest, 2 * math.ceil(size)) for size in half.tolist())
         fov = 2.0 * math.degrees(math.atan(0.5 * height / own.focal[0]))
         self._ideal = replace(planned, width=width, height=height, vertical_fov=fov)
         at = self._ideal.project(rays).astype(np.float32).reshape(planned.height, planned.width, 2)
@@ -92,7 +94,10 @@ class Lens:
 def as_planned(optics: Optics, planned: PinholeCamera) -> bool:
     """Return whether cameras have the intrinsics that are planned."""
     plain = ideal_optics(planned, 1)
-    return all(np.all(getattr(optics, part) == getattr(plain, part)) for part in ("focal", "centre", "distortion"))
+    return optics.further is None and all(
+        np.allclose(getattr(optics, part), getattr(plain, part), rtol=1e-12, atol=0.0)
+        for part in ("focal", "centre", "distortion")
+    )
 
 
 def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
@@ -194,7 +199,7 @@ class BallDetector(Detector[HandEyeModel]):
     def __init__(self, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
         """Take a scene with a ball on the flange."""
         super().__init__(DepthCamera.streams)
-        self._scene, self._camera = scene, DepthCamera(scene, config, config.camera(), ball_radius)
+        self._scene, self._camera = scene, DepthCamera(scene, config, CAMERA, ball_radius)
 
     def measure(self, model: HandEyeModel, q: FloatArray) -> tuple[FloatArray | None, None]:
         """Return the ball's centre as fitted to the depths, (3,) m, or None."""
@@ -231,8 +236,8 @@ class MarkCameras:
 
     def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig) -> None:
         """Take a scene with the target of a set-up."""
-        self._scene = scene
-        self._lenses = [Lens(CAMERA, model.optics, camera) for camera in range(model.setup.cameras)]
+        self._scene, self._planned = scene, model.planned
+        self._lenses = [Lens(model.planned, model.optics, camera) for camera in range(model.setup.cameras)]
         self._colours = MARK_COLOURS[: len(model.target)]
         self._centre = sphere_centre if len(model.target) == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
@@ -265,8 +270,8 @@ class MarkCameras:
     def _find(self, images: list[ByteArray]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""
         marks = [find_marks(image, self._colours) for image in images]
-        middle = np.array([CAMERA.width, CAMERA.height]) / 2.0
-        pixels = [[middle if mark is None else self._centre(mark, CAMERA) for mark in row] for row in marks]
+        middle = np.array([self._planned.width, self._planned.height]) / 2.0
+        pixels = [[middle if mark is None else self._centre(mark, self._planned) for mark in row] for row in marks]
         return np.array([[mark is not None for mark in row] for row in marks]), np.array(pixels)
 
 
@@ -285,10 +290,10 @@ class BallCameras:
         name = model.setup.name
         if len(model.target) > 1:
             raise ValueError(f"sensing {name} needs the depth of {len(model.target)} points; only a ball's is measured")
-        points, planned = _some_points(model.setup), ideal_optics(CAMERA, model.setup.cameras)
+        points, planned = _some_points(model.setup), ideal_optics(model.planned, model.setup.cameras)
         if (model.setup.measure(points, model.optics) != model.setup.measure(points, planned)).any():
             raise ValueError(f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned")
-        self._camera = DepthCamera(scene, config, CAMERA, ball_radius)
+        self._camera = DepthCamera(scene, config, model.planned, ball_radius)
 
     def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
         """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
@@ -349,11 +354,6 @@ def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot
         return BallDetector(scene, config, robot.workspace.ball_radius)
     if not isinstance(model, SetupModel):
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
-    if config.camera() != CAMERA:
-        raise ValueError(
-            f"width, height and vertical_fov are those of sensing position; the images of {model.setup.name} have "
-            f"{CAMERA.width} x {CAMERA.height} px and {CAMERA.vertical_fov:g} deg"
-        )
     if needs_depth(model.setup, model.optics):
         return SetupDetector(BallCameras(model, scene, config, robot.workspace.ball_radius))
     return SetupDetector(MarkCameras(model, scene, config))

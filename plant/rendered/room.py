@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import HALF
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.marks import MARK_COLOURS, RED
 from servobench.plant.rendered.urdf import (
@@ -79,7 +80,9 @@ class Rig:
                 f"sensing {model.setup.name} has a target of {count} points; only these can be drawn: a ball, of one "
                 "point, or a plate with three or four discs that are not in line"
             )
-        return cls(model.target, model.cameras if on_hand else None, robot.workspace.scale, robot.workspace.ball_radius)
+        work, side = robot.workspace, None if robot.camera is None else robot.camera.keys.target.side
+        scale = work.scale if side is None or count == 1 else side / (2.0 * HALF)
+        return cls(model.target, model.cameras if on_hand else None, scale, work.ball_radius)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,6 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, JointSpeed, NonNegative, Number, Positive, Usual, nested, settings
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
-from servobench.plant.robot.camera import FieldOfView, PinholeCamera
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
@@ -43,12 +42,6 @@ class RenderedConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
-    width: Count = 320
-    """[px] width of the image."""
-    height: Count = 240
-    """[px] height of the image."""
-    vertical_fov: FieldOfView = 60.0
-    """[deg] vertical field of view; it covers the workspace and a margin."""
     depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
     """Model of the depth noise."""
     depth_subpixel: NonNegative = 0.08
@@ -73,10 +66,6 @@ class RenderedConfig:
         return tuple(
             Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in enumerate(self.obstacles, 1)
         )
-
-    def camera(self) -> PinholeCamera:
-        """Return the camera's intrinsics."""
-        return PinholeCamera(self.width, self.height, self.vertical_fov)
 
 
 def rendered_config(robot: Robot) -> RenderedConfig:

@@ -8,7 +8,7 @@ offset the error is 2.5 mm at 1.3 m.
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -87,6 +87,9 @@ class PinholeCamera:
                 [0.0, 0.0, -1.0, 0.0],
             ]
         )
+
+
+CAMERA: Final = PinholeCamera()  # planned camera of the bench
 
 
 def view_matrix(X_BC: FloatArray) -> FloatArray:

@@ -1,5 +1,7 @@
 """Robots by name or by file: `--robot ur10e`, `panda`, `random_arm:7`, `my_ur10e.yaml`, `arm.toml`, `arm.urdf`.
 
+A robot with the file of a user's camera is `ur10e with my_camera.toml`.
+
 A random arm is drawn from its number: the number of joints, lengths and offsets of the links, twists and the signs of
 the gears. It is as long as a UR5, and drawn again until it can work at the bench. The tool on its flange and the turn
 of the camera are those of the run's mismatch. Controllers know the joint limits and the number of features, no model.
@@ -11,6 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,6 +22,7 @@ from servobench.plant.contract.files import user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
+from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.workspace import find_workspace, with_ball
@@ -27,6 +31,7 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
     title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
+WITH: Final = " with "  # between a robot and the file of its camera
 
 
 def find_robot(text: str) -> Robot:
@@ -34,11 +39,14 @@ def find_robot(text: str) -> Robot:
 
     Args:
         text: a key of `ROBOTS`, `random_arm:` and a number, or the path of a file that ends in .yaml (a factory
-            calibration of Universal Robots), .toml (a DH table) or .urdf.
+            calibration of Universal Robots), .toml (a DH table) or .urdf; each also with the file of a camera.
 
     Raises:
         ValueError: an unknown name, or a file that cannot be used.
     """
+    name, _, camera = text.partition(WITH)
+    if camera:
+        return _equipped(find_robot(name), camera, _changed("camera", user_path(camera)))
     if text in ROBOTS:
         return ROBOTS[text]()
     kind, _, number = text.partition(":")
@@ -52,11 +60,21 @@ def find_robot(text: str) -> Robot:
             f"unknown robot {text!r}: {suggest(text, ROBOTS)}; or a file: a factory calibration (.yaml), a DH table "
             f"(.toml) or a .urdf; or an arm that is drawn, {RANDOM_ARM}:7"
         )
+    return _read(text, _changed("robot", path))
+
+
+def _changed(kind: str, path: Path) -> int:
+    """Return when a file was changed [ns]."""
     try:
-        changed = path.stat().st_mtime_ns
+        return path.stat().st_mtime_ns
     except OSError as error:
-        raise ValueError(f"robot file {path} cannot be read: {error.strerror}") from error
-    return _read(text, changed)
+        raise ValueError(f"{kind} file {path} cannot be read: {error.strerror}") from error
+
+
+@cache
+def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
+    del changed
+    return robot.equipped(read_camera(user_path(camera)))
 
 
 @cache

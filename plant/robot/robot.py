@@ -11,7 +11,7 @@ gravity; a UR5 has 1.2 times this torque in its shoulder and more in its wrists.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -20,8 +20,10 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.arm import JointLimits, SerialArm, rotation_from_rpy
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
+from servobench.plant.robot.camera_file import OwnCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.workspace import Workspace
+from servobench.plant.robot.workspace import Clearance, Workspace
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,7 @@ class Robot:
         measured: the arm as its factory measured it; None where only the nominal one is known.
         note: a line for the user about assumptions; empty for none.
         known: whether controllers may know it; of another one they know joints and features alone.
+        camera: of the user, in place of the bench's; None for none.
     """
 
     name: str
@@ -84,6 +87,7 @@ class Robot:
     measured: SerialArm | None = None
     note: str = ""
     known: bool = True
+    camera: OwnCamera | None = None
 
     @property
     def n(self) -> int:
@@ -93,7 +97,29 @@ class Robot:
     @cached_property
     def nominal(self) -> HandEyeModel:
         """The nominal arm under the camera as planned, which controllers may know."""
-        return HandEyeModel(self.arm, self.workspace.camera_pose())
+        return HandEyeModel(self.arm, self.camera_pose)
+
+    @property
+    def camera_pose(self) -> FloatArray:
+        """The first fixed camera as planned, X_BC (4, 4)."""
+        own = None if self.camera is None else self.camera.keys.pose
+        return self.workspace.camera_pose() if own is None or own.frame != "base" else own.matrix
+
+    @property
+    def pinhole(self) -> PinholeCamera:
+        """Size and focal length of the image as planned."""
+        return CAMERA if self.camera is None else self.camera.pinhole
+
+    def equipped(self, camera: OwnCamera) -> Robot:
+        """Return the robot with a camera and a target of the user."""
+        target, work, arm, measured = camera.keys.target, self.workspace, self.arm, self.measured
+        if target.frame == "flange":
+            arm = replace(arm, tool=np.array(target.position))
+            measured = None if measured is None else replace(measured, tool=arm.tool)
+        robot, clear = replace(self, arm=arm, measured=measured, camera=camera), work.clear
+        if isinstance(clear, Clearance):
+            clear = replace(clear, arm=arm, X_BC=robot.camera_pose, camera=camera.pinhole)
+        return replace(robot, workspace=replace(work, ball=target.radius, clear=clear))
 
 
 DENSITY: Final = 1100.0  # [kg/m³] of the UR5's links as cylinders, in the mean

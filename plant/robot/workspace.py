@@ -22,7 +22,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
 CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
@@ -51,6 +51,7 @@ class Workspace:
         stretched: (n,) [rad], a start at which the Jacobian is nearly singular.
         clear: returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None
             where all of the box is.
+        ball: radius of a ball of the user's [m]; None for that of the bench.
     """
 
     scale: float
@@ -62,6 +63,7 @@ class Workspace:
     moves: Mapping[str, Move]
     stretched: FloatArray
     clear: Clear | None = None
+    ball: float | None = None
 
     @property
     def camera_distance(self) -> float:
@@ -71,7 +73,7 @@ class Workspace:
     @property
     def ball_radius(self) -> float:
         """Radius of the ball, which has the same size in the image of every arm [m]."""
-        return BALL_RADIUS * self.scale
+        return BALL_RADIUS * self.scale if self.ball is None else self.ball
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -100,7 +102,6 @@ BUILT_IN: Final = 0.4  # share of random postures with overlap above which two t
 IMAGE_SHARE: Final = 0.8  # share of the image's half sides for the ball, with a margin for a turned camera
 MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian; of a UR5
 STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
-CAMERA: Final = PinholeCamera()
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +152,7 @@ class Clearance:
         scale: of all lengths over those of a UR5's bench.
         ball_radius: [m].
         pairs: (p, 2), tubes that must not meet.
+        camera: its image.
     """
 
     arm: SerialArm
@@ -161,6 +163,7 @@ class Clearance:
     scale: float
     ball_radius: float
     pairs: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+    camera: PinholeCamera = CAMERA
 
     def __call__(self, joint_position: FloatArray, *, singular: bool = False) -> BoolArray:
         """Return whether joint positions (..., n) rad are fit to work in, (...).
@@ -196,7 +199,7 @@ class Clearance:
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
         p_C = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
-        half = IMAGE_SHARE * np.array([CAMERA.width, CAMERA.height]) / (2.0 * CAMERA.focal)
+        half = IMAGE_SHARE * np.array([self.camera.width, self.camera.height]) / (2.0 * self.camera.focal)
         inside = (np.abs(p_C[..., :2]) <= half * p_C[..., 2:]).all(axis=-1) & (p_C[..., 2] > 0.0)
         line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
         free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius

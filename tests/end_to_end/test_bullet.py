@@ -87,7 +87,7 @@ def test_joint_angles_that_are_not_finite_end_the_run(open_plant, monkeypatch):
 
 
 def test_a_pybullet_without_numpy_works_too(open_plant, monkeypatch):
-    plant = open_plant(replace(IDEAL, width=160, height=120))
+    plant = open_plant(IDEAL)
     expected, original = plant.reset(0), pybullet.getCameraImage
 
     def tuples(*args, **options):

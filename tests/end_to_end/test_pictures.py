@@ -322,6 +322,7 @@ def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
     _, (path,) = paper(monkeypatch, folder, "--kind", "errors", "--format", "pgf")
     width = re.search(r"\\pgfpathrectangle\{\\pgfpointorigin\}\{\\pgfqpoint\{([\d.]+)in", path.read_text())[1]
     assert float(width) == pytest.approx(3.5)
+    assert "ukf\\_mfac" in path.read_text()
 
 
 @pytest.mark.parametrize(
@@ -330,7 +331,7 @@ def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
         (("--kind", "error"), "--kind: unknown 'error': did you mean 'errors'?"),
         (("--controllers", "ukf_mfca"), "--controllers: unknown 'ukf_mfca': did you mean 'ukf_mfac'?"),
         (("--names", "a,b"), "--names has 2 names for 1 controllers: ukf_mfac"),
-        (("--width", "3.5"), "--width must be from 2in to 20in, as 3.5in, 8.9cm or 89mm, got 3.5"),
+        (("--width", "3.5"), "--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got 3.5"),
         (("--format", "eps"), "--format: unknown 'eps': "),
         (("--format", "pgf"), "--format pgf needs a TeX while it is drawn, pdflatex, lualatex or xelatex, and there"),
         (("--kind", "tracking"), "has no figure of tracking"),

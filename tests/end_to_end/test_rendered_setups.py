@@ -99,8 +99,6 @@ def test_a_hidden_disc_is_lost_alone_and_held(open_setup):
 
 def test_what_cannot_be_rendered_is_refused(open_setup):
     model = true_model("pixel")
-    with pytest.raises(ValueError, match="the images of pixel have 320 x 240 px and 60 deg"):
-        open_setup(model, replace(IDEAL, width=640))
     two = SensingSetup("two", "", ("a", "b", "c", "d"), "px", model.setup.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
     with pytest.raises(ValueError, match="a ball, of one point, or a plate with three or four discs"):
         open_setup(replace(model, setup=two, target=np.array(two.target)))

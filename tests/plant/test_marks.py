@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics, locate, project
+from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
 from servobench.plant.cameras.registry import SETUPS
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
+from servobench.plant.robot.camera import CAMERA
 
 COLUMNS, ROWS = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
 RAYS = CAMERA.rays(COLUMNS.ravel(), ROWS.ravel()).reshape(CAMERA.height, CAMERA.width, 3)

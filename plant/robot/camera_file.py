@@ -1,0 +1,289 @@
+"""A user's camera and target from a file: image, intrinsics, place, timing and noise; an example is in own_robot.md.
+
+The file is a TOML with the keys of `CameraFile`, or the intrinsics alone: a `camera_info` of ROS or a file of OpenCV's
+`FileStorage`, which a TOML may also name as its `intrinsics`. What it leaves out is as the bench has it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import read_toml, reason
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import NonNegative, Number, Positive, nested, override, settings
+from servobench.plant.robot.camera import PinholeCamera
+
+COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3")  # of OpenCV, in its order
+MODELS: Final = ("plumb_bob", "rational_polynomial")  # ROS's names of this model; k4, k5 and k6 of the second are 0
+RANGES: Final = {  # of numbers: unit, least and largest
+    "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
+    "rate": ("Hz", 0.5, 1000), "latency": ("s", 0, 5),
+}  # fmt: skip
+FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
+FAR: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
+ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
+INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in files of ROS and OpenCV
+    "width": ("image_width", "width"),
+    "height": ("image_height", "height"),
+    "matrix": ("camera_matrix", "cameraMatrix", "k", "K"),
+    "distortion": ("distortion_coefficients", "distCoeffs", "dist_coeffs", "d", "D"),
+    "distortion_model": ("distortion_model",),
+}
+Row = tuple[Number, ...]
+
+
+@settings
+class Place:
+    """A place on the base or on the flange."""
+
+    frame: Literal["", "base", "flange"] = ""
+    """Empty: the bench places it."""
+    position: Row = ()
+    """[m]"""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        most = FAR.get(self.frame, math.inf)
+        if bool(self.frame) != bool(self.position) or len(self.position) not in (0, 3):
+            raise ValueError('a place needs frame, "base" or "flange", and position, three numbers in m')
+        if max(map(abs, self.position), default=0.0) > most:
+            raise ValueError(f"position must be in m, at most {most:g} m on the {self.frame}, got {self.position}")
+
+
+@settings
+class Pose(Place):
+    """The place of a camera; its z axis is the optical axis, x points right and y down in the image."""
+
+    rotation: tuple[Row, ...] | Row = (0.0, 0.0, 0.0, 1.0)
+    """Rows of the rotation matrix, or a quaternion x, y, z, w as in ROS."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        super().__post_init__()
+        _ = self.matrix
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """The pose in its frame, (4, 4)."""
+        given = np.array(self.rotation) if len({np.size(row) for row in self.rotation}) == 1 else np.zeros(0)
+        pose = np.eye(4)
+        if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
+            pose[:3, :3] = Rotation.from_quat(given).as_matrix()
+        elif given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < ROUNDED < np.linalg.det(given):
+            pose[:3, :3] = Rotation.from_matrix(given).as_matrix()
+        else:
+            raise ValueError(
+                f"pose.rotation must be a rotation matrix or a quaternion of length 1, got {self.rotation}"
+            )
+        pose[:3, 3] = self.position or 0.0
+        return pose
+
+
+@settings
+class Target(Place):
+    """Size and place of the target."""
+
+    radius: Positive | None = None
+    """[m] of the ball."""
+    side: Positive | None = None
+    """[m] of the plate's square, at the corners of which the discs are."""
+
+
+@settings
+class CameraFile:
+    """The keys of a file."""
+
+    width: int = 0
+    """[px]"""
+    height: int = 0
+    """[px]"""
+    matrix: tuple[Row, ...] = ()
+    """[px] f_x, 0, c_x; 0, f_y, c_y; 0, 0, 1, with c counted from the upper left corner of the image."""
+    vertical_fov: Positive | None = None
+    """[deg] in place of the matrix: square pixels about the middle of the image."""
+    distortion: dict[str, Number] | Row = ()
+    """Coefficients by name or in OpenCV's order."""
+    distortion_model: str = MODELS[0]
+    """By ROS's name."""
+    rate: Positive | None = None
+    """[Hz] of the frames."""
+    latency: NonNegative | None = None
+    """[s] between exposure and delivery of a frame."""
+    noise: str | Number = ""
+    """Deviation of each feature with its unit, such as 0.5px, or 2mm for places by depth."""
+    pose: Pose = nested(Pose)
+    """Of the camera."""
+    target: Target = nested(Target)
+    """Before the camera."""
+    intrinsics: str = ""
+    """File beside this one, of ROS or OpenCV."""
+    second: str = ""
+    """File beside this one, of the second camera of a stereo pair."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnCamera:
+    """A user's camera.
+
+    Attributes:
+        files: from which it was read, its own first.
+        keys: of the file.
+        matrix: (3, 3) [px], of intrinsics.
+        distortion: k1, k2, p1, p2, k3 [1].
+        second: of a stereo pair; None for a single camera.
+    """
+
+    files: tuple[Path, ...]
+    keys: CameraFile
+    matrix: FloatArray
+    distortion: tuple[float, ...]
+    second: OwnCamera | None
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return self.files[0].name
+
+    @cached_property
+    def pinhole(self) -> PinholeCamera:
+        """An ideal camera with its size and horizontal focal length."""
+        fov = 2.0 * math.degrees(math.atan(0.5 * self.keys.height / float(self.matrix[0, 0])))
+        return PinholeCamera(self.keys.width, self.keys.height, fov, far=2.0 * FAR["base"])
+
+    def sensing(self, usual: SensingConfig, period: float) -> SensingConfig:
+        """Return the settings of a sensor with this camera's timing and noise.
+
+        A frame takes a multiple of the control `period` [s], or else whole milliseconds.
+
+        Raises:
+            ValueError: a noise that cannot be read.
+        """
+        keys, changes = self.keys, dict[str, Any]()
+        if keys.rate is not None:
+            count = round(1.0 / (keys.rate * period))
+            exact = abs(count * period * keys.rate - 1.0) < 1e-5
+            changes["frame_period"] = count * period if exact else max(1, round(1e3 / keys.rate)) / 1e3
+        changes |= {} if keys.latency is None else {"latency": keys.latency}
+        return override(str(self.files[0]), usual, changes | ({"feature_noise": keys.noise} if keys.noise else {}))
+
+
+def read_camera(path: Path) -> OwnCamera:
+    """Return the camera of a file.
+
+    Raises:
+        ValueError: a file that cannot be used; one line with its path.
+    """
+    toml = path.suffix.lower() == ".toml"
+    values = read_toml("camera file", path) if toml else {"intrinsics": path.name}
+    try:
+        keys = override("it", CameraFile(), values)
+        files = [path, path.parent / keys.intrinsics] if toml and keys.intrinsics else [path]
+        if keys.intrinsics:
+            keys = override("it", keys, read_intrinsics(files[-1]))
+        second = read_camera(path.parent / keys.second) if keys.second else None
+        camera = OwnCamera(
+            (*files, *(second.files if second else ())), keys, _matrix(keys), _coefficients(keys), second
+        )
+        _check(camera)
+    except ValueError as error:
+        raise ValueError(f"camera file {path}: {error}") from error
+    return camera
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads OpenCV's matrices as mappings."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))  # type: ignore[arg-type]
+
+
+def read_intrinsics(path: Path) -> dict[str, Any]:
+    """Return size, matrix and distortion of a `camera_info` of ROS or a file of OpenCV's `FileStorage`.
+
+    Raises:
+        ValueError: a file that cannot be read, or a key that is missing.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        found: Any = yaml.load(text.partition("\n")[2] if text.startswith("%YAML") else text, _Loader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path.name} cannot be read: {reason(error)}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
+    keys = dict[str, Any]()
+    for key, names in INTRINSICS.items():
+        given = [found[name] for name in names if isinstance(found, dict) and name in found]
+        if not given and not key.startswith("distortion"):
+            raise ValueError(f"{path.name} has no {names[0]}")
+        for value in given[:1]:
+            keys[key] = value.get("data", []) if isinstance(value, dict) else value
+    numbers = keys["matrix"] if isinstance(keys["matrix"], list) else []
+    return keys | {"matrix": [numbers[row : row + 3] for row in range(0, len(numbers), 3)]}
+
+
+def _matrix(keys: CameraFile) -> FloatArray:
+    """Return the intrinsic matrix, (3, 3) px, of numbers that are checked."""
+    if isinstance(keys.noise, float):
+        raise ValueError(f'noise needs its unit, such as "0.5px", or "2mm" for places by depth; got {keys.noise:g}')  # noqa: TRY004
+    for name, (unit, least, most) in RANGES.items():
+        if (value := getattr(keys, name)) is not None and not least <= value <= most:
+            raise ValueError(f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}")
+    size = keys.width, keys.height
+    if bool(keys.matrix) == (keys.vertical_fov is not None):
+        raise ValueError("one of matrix [px] and vertical_fov [deg] must be given")
+    f = 0.5 * size[1] / math.tan(math.radians(keys.vertical_fov or 90.0) / 2.0)
+    rows = keys.matrix or ((f, 0.0, size[0] / 2.0), (0.0, f, size[1] / 2.0), (0.0, 0.0, 1.0))
+    K = np.array(rows) if [len(row) for row in rows] == [3, 3, 3] else np.zeros((3, 3))
+    if (K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0.0, 0.0, 0.0, 0.0, 1.0)).any():
+        raise ValueError(f"matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px, got {rows}")
+    for f in (float(K[0, 0]), float(K[1, 1])):
+        if not FOCAL[0] * size[0] <= f <= FOCAL[1] * size[0]:
+            wanted = "in px it is the focal length in mm over the side of a pixel in mm"
+            raise ValueError(f"matrix: a focal length of {f:g} px does not fit a width of {size[0]} px; {wanted}")
+    if not ((K[:2, 2] > 0.0) & (K[:2, 2] < size)).all():
+        raise ValueError(f"matrix: the principal point {K[:2, 2].tolist()} px must be in the image")
+    return K
+
+
+def _coefficients(keys: CameraFile) -> tuple[float, ...]:
+    """Return k1, k2, p1, p2 and k3."""
+    given, wanted = keys.distortion, f"{MODELS[0]} with {', '.join(COEFFICIENTS)}"
+    if keys.distortion_model not in MODELS:
+        raise ValueError(f"distortion_model {keys.distortion_model!r} is not known; wanted {wanted}")
+    if isinstance(given, dict):
+        if unknown := sorted(set(given) - set(COEFFICIENTS)):
+            raise ValueError(f"distortion has no coefficient {unknown[0]!r}; wanted {wanted}")
+        given = tuple(given.get(name, 0.0) for name in COEFFICIENTS)
+    if len(given) in (1, 2, 3) or any(given[5:]):
+        raise ValueError(f"distortion must be {wanted}, got {given}")
+    return (*given[:5], 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+
+
+def turning_point(k1: float, k2: float, k3: float) -> float:
+    """Return the least r² at which r (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) no longer grows; 1e6 where it always does."""
+    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(min(real, default=1e6))
+
+
+def _check(camera: OwnCamera) -> None:
+    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
+    k1, k2, _, _, k3 = camera.distortion
+    s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
+    far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
+    if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
+        raise ValueError(f"distortion {list(camera.distortion)} folds the image before its corners")
+    if camera.second is not None:
+        pair = [(each.width, each.height, each.pose.frame) for each in (keys, camera.second.keys)]
+        if pair[0] != pair[1]:
+            raise ValueError(f"{keys.second}, the second camera, must have the same width, height and pose.frame")

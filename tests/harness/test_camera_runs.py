@@ -1,0 +1,134 @@
+"""Runs with a user's camera: features within its image, side by side, from a folder that is resumed, and refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import servobench as package
+from kit.command import judged, servobench
+from servobench.harness.batch.results import read_manifest
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.experiment import build_experiment, draw
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
+from servobench.harness.studies.challenge import find_challenge
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.kinematic import ENTRY as KINEMATIC
+
+CAMERA = """
+width = 640
+height = 480
+matrix = [[615.0, 0.0, 318.0], [0.0, 615.0, 242.0], [0.0, 0.0, 1.0]]
+distortion = {k1 = 0.12, k2 = -0.25, p1 = 0.001, p2 = -0.0005}
+rate = 15
+noise = "0.5px"
+"""
+ON_FLANGE = '[pose]\nframe = "flange"\nposition = [0.0, -0.07, 0.05]\n'
+WORD = "ur10e with mine.toml"
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(CAMERA + ON_FLANGE)
+    Path("planned.toml").write_text(CAMERA.replace('noise = "0.5px"', ""))
+
+
+def request(task="random", seed=1, sensing="pixel:hand", plant="kinematic", robot=WORD):
+    return RunRequest(plant, "regression_mfac", task, "moderate", seed, robot=robot, sensing=sensing)
+
+
+def test_features_are_in_its_image_and_change_at_its_rate():
+    result = run_experiment(request(), Settings({"random": {"duration": 3.0}}))
+    assert result.row["run_id"] == "kinematic-ur10e+mine.toml-pixel_hand-regression_mfac-random-moderate-1"
+    assert result.steps is not None
+    u, v = (result.steps[f"feature_{name}_px"] for name in ("u", "v"))
+    assert u.between(0, 640).all()
+    assert v.between(0, 480).all()
+    assert (
+        max(u.max() - 320, 320 - u.min()) > 160 or max(v.max() - 240, 240 - v.min()) > 120
+    )  # beyond the bench's image
+    frames = (result.steps["time_s"] / 0.067 + 1e-9).astype(int).diff().iloc[1:].to_numpy() > 0
+    np.testing.assert_array_equal(u.diff().iloc[1:].to_numpy() != 0.0, frames)
+
+
+def test_its_noise_is_that_of_the_file():
+    plant = build_experiment(
+        request(), Settings({"run": {"period": 0.067}, "kinematic": {"command_delay": 0.067}})
+    ).plant
+    observation = plant.reset(4)
+    errors = []
+    for _ in range(200):
+        errors.append(observation.feature - plant.truth().feature)
+        observation = plant.step(package.Command(np.zeros(6)))
+    assert np.std(errors) == pytest.approx(0.5, rel=0.15)
+
+
+def test_runs_side_by_side_have_the_rows_of_single_ones():
+    requests = [request(seed=seed) for seed in (1, 2)]
+    settings = Settings({"random": {"duration": 1.0}})
+    together = carry_out_together([resolve(each, settings) for each in requests])
+    for each, many in zip(requests, together, strict=True):
+        single = run_experiment(each, settings, steps=False)
+        both = [judged(pd.DataFrame([result.row])) for result in (many, single)]
+        pd.testing.assert_frame_equal(*both, check_exact=True)
+
+
+@pytest.mark.parametrize(("sensing", "robot"), [("pixel:hand", WORD), ("pixel", "ur5 with planned.toml"),
+                                                ("position", "panda with planned.toml")])  # fmt: skip
+def test_a_circle_is_within_the_image_and_leads_through_where_the_target_is(sensing, robot):
+    drawn = draw(resolve(request("circle", sensing=sensing, robot=robot), Settings()))
+    points = drawn.scenario.reference.points(np.linspace(0.0, 10.0, 50))
+    assert drawn.true.valid_at(points, 1.0).all()
+    middle = 0.5 * (points[0] + points[25])
+    assert np.linalg.norm(middle - drawn.true.points(drawn.scenario.start)) < 0.2 * drawn.true.distance
+
+
+def test_a_folder_is_resumed_with_the_same_camera_only(monkeypatch, capsys):
+    command = ["compare", "--plants", "kinematic", "--controllers", "constant", "--tasks", "random", "--seeds", "2"]
+    command += ["--camera", "mine.toml", "--sensing", "pixel:hand", "--set", "random.duration=0.5", "--no-report"]
+    command += ["--workers", "1", "--out", "out"]
+    assert servobench(monkeypatch, *command) == 0
+    manifest = read_manifest(Path("out"))
+    assert manifest["robots"][0]["camera"]["pose"]["position"] == [0.0, -0.07, 0.05]
+    assert list(manifest["files"]) == ["mine.toml"]
+    assert manifest["configuration"]["kinematic"]["sensing.frame_period"] == 0.067
+    assert servobench(monkeypatch, *command, "--resume") == 0
+    Path("mine.toml").write_text(CAMERA + ON_FLANGE.replace("0.07", "0.08"))
+    capsys.readouterr()
+    assert servobench(monkeypatch, *command, "--resume") == 2
+    assert "out was begun with another version of mine.toml" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_challenge_has_the_camera_of_a_file_beside_it(tmp_path):
+    keys = 'title = "a"\nwhy = "b"\ntask = "random"\nreference = ["calibrated"]\ncamera = "planned.toml"\n'
+    (tmp_path / "mine_too.toml").write_text(keys)
+    cells = find_challenge(str(tmp_path / "mine_too.toml")).cells((), ("constant",), [0])
+    assert {cell.request.robot for cell in cells} == {f"ur5 with {tmp_path / 'planned.toml'}"}
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (("--sensing", "pixel"), "camera mine.toml is on the flange; use --sensing pixel:hand"),
+        (("--sensing", "stereo:hand"), "sensing stereo has 2 cameras, and mine.toml describes 1"),
+        (("--sensing", "position:hand"), "sensing.feature_noise is 0.5px, but the features are in m"),
+        (("--camera", "none.toml"), "camera file none.toml cannot be read: No such file or directory"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(monkeypatch, capsys, command, said):
+    arguments = ["run", "constant", "--plant", "kinematic", "--camera", "mine.toml", *command, "--out", "out"]
+    assert servobench(monkeypatch, *arguments) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_plant_with_a_camera_of_its_own_refuses_it():
+    cell = replace(KINEMATIC, name="cell", any_sensing=False)
+    with pytest.raises(ConfigurationError, match="plant cell brings a camera of its own, so --camera mine.toml does"):
+        package.run("constant", cell, task="random", robot="ur5 with mine.toml")

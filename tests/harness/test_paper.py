@@ -1,0 +1,79 @@
+"""Tables and methods of a results folder in LaTeX."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from servobench.harness.analysis.paper import latex_tables
+
+TABLE = pd.DataFrame(
+    {
+        "controller": ["ukf_mfac", "my & own"],
+        "settled [%]": ["100.0 [83.9, 100.0]", "–"],
+        "its worst 5 % [mm]": ["∞", "-0.5 [-1.0, 2.0]"],
+    }
+)
+PAIRS = pd.DataFrame({"A − B": ["a − b"], "verdict": ["better"]})
+PAGE = r"""\documentclass[conference]{IEEEtran}
+\usepackage{booktabs}
+\begin{document}
+%s
+\end{document}
+"""
+
+
+def test_a_table_has_headings_in_lines_units_below_and_every_sign_escaped():
+    (table,) = latex_tables([("100 % of a_task", TABLE)])
+    assert r"\caption{100 \% of a\_task}" in table
+    assert r"\begin{tabular}{@{}lrr@{}}\toprule" in table
+    assert r"its worst\\{}5~\%\\{}[mm]" in table
+    assert r"ukf\_mfac & 100.0 {\scriptsize [83.9, 100.0]} & $\infty$ \\" in table
+    assert r"my \& own & -- & $-$0.5 {\scriptsize [$-$1.0, 2.0]} \\" in table
+
+
+def test_the_caption_of_paired_differences_names_their_place():
+    _, pairs = latex_tables([("exp2 on kinematic", TABLE), ("paired differences", PAIRS)])
+    assert r"\caption{exp2 on kinematic: paired differences}" in pairs
+    assert r"a $-$ b & better \\" in pairs
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """The LaTeX of two short runs in which a setting is not the default."""
+    folder = tmp_path_factory.mktemp("paper")
+    names = ("compare", "--controllers", "constant,calibrated", "--tasks", "exp2", "--seeds", "2", "--no-report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
+        assert servobench(patch, *names, "--set", "exp2.duration=2", "--out", str(folder / "out")) == 0
+    return folder / "out"
+
+
+def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(monkeypatch, capsys, printed):
+    assert servobench(monkeypatch, "statistics", str(printed), "--latex") == 0
+    text = capsys.readouterr().out
+    assert r"All runs were made with servobench 0." in text
+    assert re.search(r"Python 3\.\d+\.\d+, numpy [\d.]+, scipy [\d.]+\)", text)
+    assert "Controllers: constant, calibrated; tasks: exp2; plant: kinematic (UR5)" in text
+    assert "the same 2 random robots (seeds 0, 1; 4 runs)" in text
+    assert "Settings other than the defaults of this version: exp2.duration = 2.0." in text
+    assert "@misc{servobench," in text
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
+def test_a_page_of_a_paper_can_be_typeset_with_what_is_printed(monkeypatch, capsys, printed, tmp_path):
+    servobench(monkeypatch, "statistics", str(printed), "--latex")
+    (tmp_path / "page.tex").write_text(PAGE % capsys.readouterr().out)
+    made = subprocess.run(
+        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if "IEEEtran.cls' not found" in made.stdout or "booktabs.sty' not found" in made.stdout:
+        pytest.skip("this TeX has no IEEEtran or no booktabs")
+    assert made.returncode == 0, made.stdout[-2000:]
+    assert (tmp_path / "servobench.bib").read_text().startswith("@misc{servobench,")
