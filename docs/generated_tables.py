@@ -14,6 +14,8 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- methods: table -->
     <!-- methods: presets -->
     <!-- options: shared -->
+    <!-- attributes: observation=plant/contract/signals.py:Observation -->
+    <!-- interface: servobench.run,servobench.load -->
     <!-- install: report -->
     <!-- end -->
 
@@ -21,18 +23,22 @@ The meaning of a setting is the string below its field, what is allowed is its t
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
-stays as it is. `stored` links to measured tables of a study instead. `install` shows how to install servobench
-with extras: once a release is on a package index, set `RELEASED` and call `make tables`.
+stays as it is. `stored` links to measured tables of a study instead. `attributes` and `interface` print docstrings
+and signatures. `install` shows how to install servobench with extras: once a release is on a package index, set
+`RELEASED` and call `make tables`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
+import inspect
 import operator
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -57,10 +63,13 @@ PAGES = [
     ROOT / "fmus" / "ur5_mismatched" / "readme.md",
 ]
 PART = re.compile(
-    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options|install): (\S+) -->\n)(.*?)(<!-- end -->)",
+    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options|install|attributes|interface): "
+    r"(\S+) -->\n)(.*?)(<!-- end -->)",
     re.DOTALL,
 )
 RELEASED = False  # whether a release is on a package index, from which all pages then install
+NEW_LINE = "\n"
+LINE = 120  # letters
 SETTING = ("setting [unit]", "default", "allowed", "meaning")
 
 
@@ -80,6 +89,8 @@ def renewed(page: Path) -> str:
         "methods": lambda part: presets_table() if part[3] == "presets" else methods_table(),
         "options": lambda _: options_table(),
         "install": lambda part: install_lines(part[3]),
+        "attributes": lambda part: attributes_table(labelled(part[3])),
+        "interface": lambda part: interface(part[3].split(",")),
         "table": lambda part: measured_table(part, page.parent),
         "stored": lambda part: stored_links(part, page.parent),
     }
@@ -261,6 +272,84 @@ def classes_with_tables() -> frozenset[type[Any]]:
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     parts = (labelled(places) for _, kind, places, *_ in PART.findall(text) if kind == "settings")
     return frozenset(kind for part in parts for kind in part.values())
+
+
+def attributes_table(kinds: dict[str, type[Any]]) -> str:
+    """Return the table of the attributes of objects by name; those of the true robot are for bounds and left out."""
+    rows = [
+        (f"`{label}.{name}`", meaning)
+        for label, kind in kinds.items()
+        for name, meaning in attributes(kind).items()
+        if not name.startswith("true_")
+    ]
+    return table(("attribute", "content"), rows)
+
+
+def attributes(kind: type[Any]) -> dict[str, str]:
+    """Return the fields of a dataclass and its properties, each with its meaning from the docstrings.
+
+    Raises:
+        ValueError: a field has no entry below `Attributes:`.
+    """
+    text = inspect.getdoc(kind) or ""
+    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text.partition("Attributes:\n")[2], re.MULTILINE)
+    found = {name: " ".join(meaning.split()) for name, meaning in entries}
+    missing = [each.name for each in dataclasses.fields(kind) if each.name not in found]
+    if missing:
+        raise ValueError(f"{kind.__name__} has no line on {', '.join(missing)} below Attributes:")
+    properties = {name: value for name, value in vars(kind).items() if isinstance(value, property)}
+    for name, value in properties.items():
+        text = inspect.getdoc(value) or ""
+        found[name] = text[:1].lower() + text[1:]
+    return {name: meaning.rstrip(".") for name, meaning in found.items()}
+
+
+def interface(names: list[str]) -> str:
+    """Return signatures and docstrings as Python, of `CLASS(*)` those of its methods, of another class its fields."""
+    parts = []
+    for name in names:
+        place, _, word = name.removesuffix("(*)").rpartition(".")
+        thing = getattr(importlib.import_module(place), word)
+        lines = [defined(thing), inspect.getdoc(thing)]
+        if name.endswith("(*)"):
+            methods = (each for key, each in vars(thing).items() if inspect.isfunction(each) and key[0] != "_")
+            inner = [f"{documented(defined(each), inspect.getdoc(each).partition(NEW_LINE)[0])}\n" for each in methods]
+        else:
+            inner = [unquoted(str(each)) for each in inspect.signature(thing).parameters.values()]
+        whole = documented(*lines) + (
+            "\n\n" + textwrap.indent("\n".join(inner), "    ") if isinstance(thing, type) else ""
+        )
+        parts.append(f"```python\n{whole.rstrip()}\n```")
+    return "\n\n".join(parts)
+
+
+def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
+    """Return the line, or lines, that begin the definition of a function or a class."""
+    if isinstance(thing, type):
+        return f"class {thing.__name__}:"
+    found = inspect.signature(thing)
+    line = f"def {thing.__name__}{unquoted(str(found))}:"
+    if len(line) <= LINE:
+        return line
+    end = line[line.rindex(") -> ") :]
+    arguments = [unquoted(str(each)) for each in found.parameters.values()]
+    by_name = [each.kind is each.KEYWORD_ONLY for each in found.parameters.values()]
+    if any(by_name):
+        arguments.insert(by_name.index(True), "*")
+    together = f"    {', '.join(arguments)}"
+    lines = [together] if len(together) <= LINE else [f"    {each}," for each in arguments]
+    return "\n".join([f"def {thing.__name__}(", *lines, end])
+
+
+def unquoted(signature: str) -> str:
+    """Return a signature whose annotations are no texts, with `...` for a default that is an object."""
+    signature = re.sub(r"= <(?:[^<>]|<\w+>)*>", "= ...", signature)
+    return re.sub(r"(: |-> )'([^'=]*)'", r"\1\2", signature).replace("'", '"')
+
+
+def documented(line: str, text: str) -> str:
+    """Return the beginning of a definition with its docstring."""
+    return f"{line}\n" + textwrap.indent(f'"""{text}{NEW_LINE * (NEW_LINE in text)}"""', "    ")
 
 
 def metrics_table() -> str:

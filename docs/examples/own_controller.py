@@ -18,7 +18,7 @@ class ResolvedRate(servobench.Controller):
     def step(self, observation, reference):
         e = reference[0] - observation.feature
         J = self.jacobian(observation.joint_position)
-        u = 1.5 * J.T @ np.linalg.solve(J @ J.T + 0.02**2 * np.eye(3), e)
+        u = 1.5 * J.T @ np.linalg.solve(J @ J.T + 0.02**2 * np.eye(len(e)), e)
         return servobench.Command(u / max(1.0, np.max(np.abs(u) / self.limit)))
 
     def diagnostics(self):

@@ -278,7 +278,7 @@ class ControllerChecks:
         if not words.startswith("without"):
             return None if words == "with all aids" else words
         if "aids.delay" in values or not isinstance(getattr(entry.build, "make", None), type):
-            return f"{words}; those of a Servo are its argument `aids`, and settings of the same name"
+            return f"{words}; its settings `aids`, or the argument `aids` of its Servo, switch them on"
         try:
             ControllerChecks(with_aids(entry, EQUIPPED)).command()
         except Exception as error:  # noqa: BLE001 - of the user

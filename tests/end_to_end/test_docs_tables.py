@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import math
 import re
@@ -189,3 +190,36 @@ def test_the_keys_of_a_mapping_are_those_of_the_code():
         part = getattr(mapping, key)
         wanted |= {f"{key}.{name}" for name in vars(part)} if dataclasses.is_dataclass(part) else {key}
     assert {name for row in rows for name in names(row[0])} == wanted
+
+
+def test_an_attribute_without_a_line_in_its_docstring_is_refused():
+    @dataclasses.dataclass
+    class Given:
+        """A thing.
+
+        Attributes:
+            size: (n,), m,
+                in two lines.
+        """
+
+        size: float
+
+        @property
+        def half(self):
+            """Half of it."""
+
+    assert generated_tables.attributes(Given) == {"size": "(n,), m, in two lines", "half": "half of it"}
+    Given.__doc__ = "A thing."
+    with pytest.raises(ValueError, match="Given has no line on size below Attributes:"):
+        generated_tables.attributes(Given)
+
+
+def test_signatures_are_python():
+    text = generated_tables.interface(["servobench.run", "servobench.Controller(*)", "servobench.PlantSetup"])
+    function, kind, setup = re.findall(r"```python\n(.*?)\n```", text, re.DOTALL)
+    (parsed,) = ast.parse(function).body
+    assert [each.arg for each in parsed.args.args] == ["controller", "plant"]
+    (parsed,) = ast.parse(kind).body
+    assert [each.name for each in parsed.body if isinstance(each, ast.FunctionDef)][:2] == ["reset", "step"]
+    (parsed,) = ast.parse(setup).body
+    assert [each.target.id for each in parsed.body[1:]] == ["model", "start", "period", "nominal"]

@@ -25,10 +25,11 @@ EXAMPLES = {
 
 
 LEARNING = {"train_policy", "learned_policy"}  # tested below
+LAWS = {"damped_inverse": "DampedInverse", "kalman_inverse": "KalmanInverse", "trained_inverse": "TrainedInverse"}
 
 
 def test_every_example_is_listed_here():
-    assert {path.stem for path in FOLDER.glob("*.py")} == set(EXAMPLES) | LEARNING
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*EXAMPLES, *LEARNING, *LAWS}
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -37,6 +38,22 @@ def test_an_example_runs_and_prints(name, tmp_path, monkeypatch, capsys):
     runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(EXAMPLES[name], printed), printed
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_of_ones_own_keeps_up_with_a_method_of_the_bench_with_the_aids_and_only_with_them(law):
+    place = f"{FOLDER / law}.py:{LAWS[law]}"
+    assert servobench.check_controller(place).ok
+    names = [LAWS[law], f"{LAWS[law]}Alone", "ukf_mfac"]
+    short = {"random": {"duration": 3.0}, "circle": {"lap_time": 4.0, "radius": 0.15}}
+    runs = servobench.compare([place, f"{place}Alone", names[2]], tasks=list(short), seeds=2, settings=short)
+    middle = runs.groupby(["task", "controller"])[["settling_time_s", "rms_error_evaluated"]].median()
+    own, alone, method = (middle.loc["random", "settling_time_s"][name] for name in names)
+    assert own < 1.5 * method
+    assert own < alone
+    own, alone, method = (middle.loc["circle", "rms_error_evaluated"][name] for name in names)
+    assert own < 1.5 * method
+    assert alone > 10.0 * own
 
 
 def test_a_learned_policy_is_the_network_that_was_written(tmp_path, monkeypatch):
