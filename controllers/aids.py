@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_type_
 
 from annotated_types import Le
 
-from servobench.plant.contract.settings import NonNegative, Positive, Share, settings
+from servobench.plant.contract.settings import Delay, Deviation, NonNegative, Positive, Share, settings
 
 Known: TypeAlias = Literal["ignored", "identified", "given"]
 """Whether a quantity is left out, identified from the motions of the run, or given by a number."""
@@ -76,15 +76,15 @@ class AidsConfig:
     """Saturation: a command beyond the limits is scaled, clipped by joint, or redistributed to joints with room."""
     longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
     """[s] the longest delay that is considered; for an identified one."""
-    latency: NonNegative = 0.0
+    latency: Delay = 0.0
     """[s] latency of the camera; for a given delay. A method that gets the truth gets the true one."""
-    command_delay: NonNegative = 0.05
+    command_delay: Delay = 0.05
     """[s] until a command shows in the joints; for a given response, as the next one."""
-    lag: NonNegative = 0.05
+    lag: Delay = 0.05
     """[s] time constant of the joints."""
     response_length: Annotated[Positive, Le(2.0)] = 0.6
     """[s] within which joints respond to a command; for an identified response."""
-    feature_noise: Positive = 0.001
+    feature_noise: Deviation = 0.001
     """[unit of the feature] standard deviation of a feature; the first guess where it is identified."""
     delay_margin: NonNegative = 6.0
     """[1] by which a delay must be better than the present one, in −2 log likelihood."""

@@ -25,7 +25,7 @@ from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import JointSpeed, NonNegative, Positive, ShareBelowOne, Usual, nested, settings
+from servobench.plant.contract.settings import Delay, JointSpeed, Positive, ShareBelowOne, Usual, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
 from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
@@ -39,11 +39,11 @@ class KinematicConfig:
     """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
     joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
     """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
-    lag: Annotated[NonNegative, Usual(1.0)] = 0.05
+    lag: Delay = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     overshoot: ShareBelowOne = 0.0
     """[1] of a step of the velocity: above 0 velocity loops swing at 1/τ, as stiff ones under unexpected loads do."""
-    command_delay: NonNegative = 0.05
+    command_delay: Delay = 0.05
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""

@@ -21,7 +21,7 @@ from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch, norm, outer, plus_diagonal, transposed
-from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.settings import Deviation, NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
 
@@ -33,7 +33,7 @@ class RandomWalk:
     """[m/rad] of an entry of Ĵ₀; tuned for the Kalman filter: with a larger one latency spoils the first motions."""
     walk: NonNegative = 0.089443
     """[m/rad/√s] deviation of an entry after a second of motion; tuned for the Kalman filter."""
-    feature_noise: Positive = 0.001
+    feature_noise: Deviation = 0.001
     """[m] standard deviation σ of the feature per axis, unless it is identified."""
     min_joint_step: NonNegative = 0.002
     """[rad] smaller motions are left out: they hold little but 1 mm of noise."""

@@ -25,7 +25,7 @@ from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections, select
@@ -134,8 +134,13 @@ def exceedance(runs: pd.DataFrame) -> Figure:
             errors = 1e3 * np.sort(runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy())
             shares = 1.0 - np.arange(len(errors)) / len(errors)
             axes.plot(errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4)
-        axes.axvline(5.0, color="black", linewidth=0.8)
-        axes.set(xlabel="error in the last second [mm]", ylabel="share of runs above", xscale="log", yscale="log")
+        axes.axvline(5.0, color="black", linewidth=0.8, label="settling band, 5 mm")
+        robots, (task,), (plant,) = runs["seed"].nunique(), runs["task"].unique(), runs["plant"].unique()
+        axes.set(
+            title=f"{task} on {plant}, {robots:,} robots", xlabel="error of the last second [mm]", yscale="log",
+            ylabel="share of runs with a larger error",
+        )  # fmt: skip
+        plain_logarithms(axes, "x")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return figure
 

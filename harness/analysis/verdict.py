@@ -69,7 +69,10 @@ def judge(runs: pd.DataFrame) -> Verdict:
     chosen = runs[runs["controller"].isin(ranked)]
     if len(ranked) == 1:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
-    return Verdict(_of_several(chosen, runs), (_doubts(chosen), *cautions))
+    often = _of_several(chosen)
+    if not (winners := _winners(runs, ranked)):
+        return Verdict(often, (_doubts(chosen), *cautions))
+    return Verdict(winners, (often, _doubts(chosen), *cautions))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
@@ -134,21 +137,20 @@ def _of_one_controller(runs: pd.DataFrame) -> str:
     return sentence + "."
 
 
-def _of_several(runs: pd.DataFrame, beside: pd.DataFrame) -> str:
-    """Return the result of the runs of ranked controllers; those `beside` include bounds, which set margins."""
+def _of_several(runs: pd.DataFrame) -> str:
+    """Return how often ranked controllers succeeded."""
     shares = _shares(runs)
     asked, most, least = asked_of(runs), max(shares.values()), min(shares.values())
     best, worst = ([name for name, share in shares.items() if share == each] for each in (most, least))
     if most == 0.0:
         return f"None of the {len(shares)} controllers {asked} in any of {len(runs)} runs."
-    winners = _winners(beside, list(shares))
     if most == least:
         everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
-        return f"{winners}{everyone} {asked} in {often}."
+        return f"{everyone} {asked} in {often}."
     first, last = (_share(runs[runs["controller"] == names[0]]) for names in (best, worst))
     top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}"
-    return f"{winners}{top}; least often {_listed(worst)}, in {last}."
+    return f"{top}; least often {_listed(worst)}, in {last}."
 
 
 class _Standing(NamedTuple):
@@ -159,21 +161,24 @@ class _Standing(NamedTuple):
     undecided: tuple[str, ...]
     ahead: tuple[str, ...]  # shown to be better than the first, which has the higher success rate
     behind: str  # the next that is shown to be worse; empty without one
-    by: float  # mean difference to it [unit]; NaN where it loses more runs
+    by: float  # mean difference to it [unit]; NaN where only lost runs tell
     metric: str
     unit: str
     margin: float  # [unit] that does not matter
 
 
 def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
-    """Return a sentence that names the best of some controllers in each place, and how large the difference is."""
+    """Return a sentence that names the best of some controllers in each place, and how large the difference is.
+
+    Empty where nothing is shown.
+    """
     known = [_standing(*each) for each in _competitions(runs, names)]
     if not any(len(each.equal) > 1 or each.behind or each.ahead for each in known):
-        return "Which controller is better is undecided. " if known else ""
+        return ""
     groups: dict[tuple[object, ...], list[_Standing]] = {}
     for each in known:
         groups.setdefault((each.equal, each.undecided, each.ahead, each.behind, each.metric), []).append(each)
-    return "; ".join(_clause(own, len(known)) for own in groups.values()) + ". "
+    return "; ".join(_clause(own, len(known)) for own in groups.values()) + "."
 
 
 def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
@@ -184,10 +189,13 @@ def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
         for verdict in ("equivalent", "undecided", "worse", "better")
     }
     behind = next(iter(by_verdict["better"]), "")
-    by = -against[behind].mean.value if behind and not against[behind].lost[1] else math.nan
+    small = factor * margin(metric, place)
+    by = -against[behind].mean.value if behind and against[behind].mean.high < -small else math.nan
+    best = (order[0], *by_verdict["equivalent"])
+    equal = tuple(name for name in dict.fromkeys(own["controller"]) if name in best)
     return _Standing(
-        words, (order[0], *by_verdict["equivalent"]), by_verdict["undecided"], by_verdict["worse"], behind, by,
-        metric, unit, factor * margin(metric, place),
+        words, equal, by_verdict["undecided"], by_verdict["worse"], behind, by,
+        metric, unit, small,
     )  # fmt: skip
 
 
@@ -195,14 +203,16 @@ def _clause(places: Sequence[_Standing], count: int) -> str:
     """Return the result of places with the same winners, of `count` places in all."""
     one, label = places[0], METRICS[places[0].metric].label
     where = f" in {_listed([each.where for each in places], MANY)}" if count > 1 else ""
-    many = len(one.equal) > 1
-    words = f"{_listed(one.equal, MANY)} {'are' if many else 'is'} {'first' if one.undecided else 'best'}{where}"
+    many, parts = len(one.equal) > 1, []
     if many:
-        words += f", practically equal (within {max(each.margin for each in places):.2g} {one.unit} in {label})"
-    if one.behind:
-        low, high = (f"{end(each.by for each in places):.2f}" for end in (min, max))
-        size = "by fewer lost runs" if "nan" in (low, high) else f"by {low if low == high else f'{low} to {high}'}"
-        words += f", ahead of `{one.behind}` {size}" + ("" if "lost" in size else f" {one.unit} in {label}")
+        parts.append(f"equal within {max(each.margin for each in places):.2g} {one.unit}")
+    low, high = (f"{end(each.by for each in places):.2f}" for end in (min, max))
+    fewer_lost = one.behind and "nan" in (low, high)
+    if one.behind and not fewer_lost:
+        parts.append(f"{low if low == high else f'{low} to {high}'} {one.unit} ahead of `{one.behind}`")
+    words = f"{_listed(one.equal, MANY)} {'are' if many else 'is'} {'first' if one.undecided else 'best'}{where}"
+    words += f": {' and '.join(parts)} in {label}" if parts else ""
+    words += f", losing fewer runs than `{one.behind}`" if fewer_lost else ""
     if one.undecided:
         words += f", undecided against {_listed(one.undecided, MANY)}"
     return words + (f", though {_listed(one.ahead, MANY)} had less {label}" if one.ahead else "")

@@ -46,6 +46,11 @@ def with_camera(robot: str, camera: Path) -> str:
     return word
 
 
+def short_name(robot: str) -> str:
+    """Return the word for a robot, and for its camera, without the folders of files."""
+    return catalogue.WITH.join(Path(part).name for part in robot.split(catalogue.WITH))
+
+
 def sensing_names() -> list[str]:
     """Return the words of all sensing set-ups of this package, each with fixed cameras and with cameras on the hand."""
     return [str(Sensing(setup, mount)) for setup in SETUPS.values() for mount in (FIXED, HAND)]

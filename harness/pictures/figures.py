@@ -56,7 +56,7 @@ KINDS: Final = {
     "errors": Kind("Error of moves over time", OVER),
     "features": Kind("Measured features of moves", FIRST, in_page=False),
     "paths": Kind("True paths of moves, to scale", FIRST),
-    "tracking": Kind("Error along the curve, and measured features", OVER),
+    "tracking": Kind("Error along the curve, and in each feature", OVER),
     "tracking_path": Kind("Desired and true path, to scale", FIRST),
     "jacobian": Kind("Error of the estimated Jacobian", OVER),
     "settling": Kind("When each run settled, and with what error it ended", EACH),
@@ -178,7 +178,7 @@ def _sample(kind: str, group: Group) -> str:
     if how == EACH:
         return f"{seeds} seeds"
     words = f"median of {seeds} seeds, band: the middle 80 %"
-    return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
+    return f"{words}; errors in features of seed {group.seed}" if kind == "tracking" else words
 
 
 def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.installation import missing_extra
-from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.robots import DEFAULT_ROBOT, short_name
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
@@ -316,5 +316,5 @@ def _lap(run: LoggedRun) -> int:
 def _title(run: LoggedRun) -> str:
     row = run.track.row
     robot = str(row.get("robot", DEFAULT_ROBOT))
-    arm = "" if robot == DEFAULT_ROBOT else f", {Path(robot).name}"
+    arm = "" if robot == DEFAULT_ROBOT else f", {short_name(robot)}"
     return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {row['mismatch']}, seed {row['seed']}"

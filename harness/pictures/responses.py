@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from servobench.harness.analysis.comparison import handy_unit
 from servobench.harness.pictures.style import (
     CAMERA_MOVES,
     DESIRED,
@@ -63,7 +64,10 @@ QUANTITIES: Final = (
     ("acceleration [rad/s²]", "joint_acceleration_rms_rad_s2", "RMS {:.3g}"),
     ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
 )  # a column of panels each: its title, the metric written into it, and its form
+STACKED: Final = 1.5  # ratio of the heights of marks that stand above each other
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
+LATE_ROOM: Final = 1.3  # of an axis over the largest error after the approach
+NEAR: Final = 0.02  # of a time axis, within which marks stand above each other
 FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
 OUTSIDE: Final = 1e12  # of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
@@ -118,9 +122,9 @@ def draw_features(
 
 
 def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: Layout = WIDE) -> Figure:
-    """Draw the error along a curve over seeds, and below it the measured features of one run (figure 6).
+    """Draw the error along a curve over seeds, and below it the error in each feature of one run (figure 6).
 
-    Of a long run, features are drawn at its end only. On a narrow sheet there are errors only.
+    Of a long run, the latter is drawn at its end only, on a narrow sheet not at all.
     """
     if layout.columns < COLUMNS:
         figure, drawn = _draw_tasks({"": ensembles}, styles, draw_error, layout)
@@ -139,7 +143,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
         column[0].set(title=head, ylabel=f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
         shown = {name: closing[name] for name in names if name in closing}
         for axes, feature in zip(column[1:], features, strict=True) if shown else ():
-            draw_feature(axes, shown, styles, feature)
+            _draw_feature_error(axes, shown, styles, feature)
         column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
         if long:
             column[0].set_xlabel("time [s]")
@@ -245,6 +249,28 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
+def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
+    """Draw the true error in a feature of one run of each controller; its range is that after the approach."""
+    name, _, own = feature.rpartition("_")
+    unit, factor = handy_unit(own)
+    axes.axhline(0.0, color="0.4", linewidth=0.9)
+    reach = 0.0
+    for label, track in tracks.items():
+        error = factor * (track.column(f"true_feature_{feature}") - track.column(f"reference_{feature}"))
+        if not np.isfinite(error).any():
+            continue
+        axes.plot(track.time, error, label=label, **styles[label].line_arguments(len(error)))
+        if not track.completed:
+            mark_end(axes, track.time, error, styles[label])
+        late = np.abs(error[len(error) // 2 :])
+        reach = max(reach, float(np.max(late[np.isfinite(late)], initial=0.0)))
+    if reach > 0.0:
+        low, high = axes.get_ylim() if axes.get_autoscaley_on() is False else (0.0, 0.0)
+        reach = max(LATE_ROOM * reach, -low, high)
+        axes.set_ylim(-reach, reach)
+    axes.set_ylabel(f"error in\n{name} [{unit}]")
+
+
 def mark_settling_band(axes: Axes, runs: Shown) -> None:
     """Draw the error within which a run counts as settled, where the table of runs has it."""
     if math.isfinite(runs.settling_band):
@@ -253,12 +279,16 @@ def mark_settling_band(axes: Axes, runs: Shown) -> None:
 
 
 def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
-    """Mark on the settling band the median settling time of each controller."""
+    """Mark on the settling band the median settling time of each controller; equal ones stand above each other."""
+    placed: list[float] = []
+    span = shown_until(ensembles)
     for name, ensemble in ensembles.items():
         if math.isfinite(ensemble.settling_time) and math.isfinite(ensemble.settling_band):
-            style = styles[name]
+            style, time = styles[name], ensemble.settling_time
+            level = ensemble.settling_band * STACKED ** sum(abs(time - other) < NEAR * span for other in placed)
+            placed.append(time)
             edge = style.colour if style.hollow else "black"
-            axes.plot(ensemble.settling_time, ensemble.settling_band, marker="v", markersize=6.5, linestyle="",
+            axes.plot(time, level, marker="v", markersize=6.5, linestyle="",
                       color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
                       markerfacecolor=style.face, zorder=11, gid=SETTLED)  # fmt: skip
 

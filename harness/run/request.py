@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, NamedTuple, SupportsIndex, TypeAlias
 
 from annotated_types import Ge
 
-from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.robots import DEFAULT_ROBOT, short_name
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, settings
@@ -66,7 +66,7 @@ class RunSettings:
     """[s] control period"""
     preview_time: NonNegative = 0.5
     """[s] of the future reference that every controller gets, rounded up to control periods"""
-    lost_after: Positive = 1.0
+    lost_after: Annotated[Positive, Usual(20.0)] = 1.0
     """[s] without a valid feature after which a run ends"""
     camera_moves_at: ShareBelowOne = 0.5
     """share of the run after which a mismatch's `camera_move` happens"""
@@ -172,8 +172,8 @@ class RunRequest:
             _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller, self.task)
         )
         varied = "".join(map(_in_name, self.varied)) if self.varied else ""
-        parts = (Path(part).name for part in self.robot.split(WITH))
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files('+'.join(parts))}-"
+        name = short_name(self.robot).replace(WITH, "+")
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files(name)}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{_fit_for_files(Path(self.sensing).name)}-"
         return f"{plant}-{robot}{sensing}{controller}-{task}-{mismatch}{varied}-{self.seed}"
 

@@ -28,7 +28,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings
+from servobench.plant.contract.settings import Count, Duration, NonNegative, Number, Positive, settings
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
@@ -47,7 +47,7 @@ class PointTask(Task):
     """[rad] joint positions at time 0"""
     target: Vector = HOME
     """[rad] joint positions at which the target was taught"""
-    duration: Positive = 10.0
+    duration: Duration = 10.0
     """[s] length of the run"""
     into_view: bool = True
     """where cameras see pixels, draw start and target together towards the arm's home until both are in view"""
@@ -82,7 +82,7 @@ class TargetTask(Task):
     """[rad] joint positions at time 0"""
     target: Vector = (0.1, -0.1, 1.2)
     """[m] camera frame"""
-    duration: Positive = 10.0
+    duration: Duration = 10.0
     """[s] length of the run"""
 
     any_robot: ClassVar[bool] = True
@@ -109,7 +109,7 @@ class RandomTask(Task):
     """[m] least distance between start and target on the nominal model"""
     lowest: Number = 0.08
     """[m] least height of the ball above the table on the nominal model"""
-    duration: Positive = 10.0
+    duration: Duration = 10.0
     """[s] length of the run"""
 
     def scenario(self, setting: TaskSetting) -> Scenario:
@@ -157,7 +157,7 @@ class CurveTask(Task):
     """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
     radius: Positive | None = None
     """[m] of the circle, or half the length of the lemniscate; by default 0.3 m and 0.25 m on a UR5"""
-    lap_time: Positive = 10.0
+    lap_time: Duration = 10.0
     """[s] 200 points a lap at the default period"""
     laps: Count = 2
     """laps in the run; the last one is judged"""
@@ -194,7 +194,7 @@ class LineTask(Task):
     """[m] camera frame"""
     moving: Positive = 8.0
     """[s] from the beginning to the end of the line"""
-    duration: Positive = 10.0
+    duration: Duration = 10.0
     """[s] length of the run"""
 
     any_robot: ClassVar[bool] = True

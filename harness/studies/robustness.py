@@ -311,9 +311,11 @@ def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: Styles) -> None:
     """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
-    for name, limit in limits.items():
-        if name in styles and 1000.0 * limit <= line.places[-1].number:
-            axes.axvline(
-                1000.0 * limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6
-            )
-    axes.set_xlabel(f"{line.title}\n(upright: predicted limit of stability)")
+    last = line.places[-1].number
+    drawn = {name: 1000.0 * limit for name, limit in limits.items() if name in styles and 1000.0 * limit <= last}
+    for name, limit in drawn.items():
+        axes.axvline(limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6)
+    words = f"upright: predicted limit of stability of {', '.join(drawn)}" + ", others beyond" * (
+        len(drawn) < len(limits)
+    )
+    axes.set_xlabel(f"{line.title}\n{textwrap.fill(words, NOTE // 3)}" if drawn else line.title)

@@ -26,6 +26,7 @@ from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import (
+    Delay,
     Extent,
     NonNegative,
     Number,
@@ -52,15 +53,15 @@ class SensingConfig:
     feature_noise: Extent = 0.001
     """[m or px] standard deviation σ of the noise of each component, such as 1mm or 2px; of pixels in metres, their
     size in the planned image."""
-    latency: NonNegative = 0.0
+    latency: Delay = 0.0
     """[s] between exposure and delivery of a frame; a multiple of the control period, or whole milliseconds."""
     drop_probability: ShareBelowOne = 0.0
     """[1] chance that a frame is lost, independently of the others."""
-    noise_factor: NonNegative = 1.0
+    noise_factor: Annotated[NonNegative, Usual(20.0)] = 1.0
     """[1] factor on all noise of the sensor, for studies of noise."""
-    frame_period: NonNegative = 0.0
+    frame_period: Delay = 0.0
     """[s] between two frames, from the start of the run on; 0: a frame arrives at every control instant."""
-    jitter: NonNegative = 0.0
+    jitter: Delay = 0.0
     """[s] J: each frame is late by U(0, J) in addition to the latency; frames do not overtake each other."""
     noise: Family = "white"
     """Family of the noise of each component."""
@@ -80,17 +81,17 @@ class SensingConfig:
     """[1] share of the frames that are outliers: the feature is seen elsewhere."""
     outlier_size: Extent = 0.05
     """[m or px] distance of an outlier, in a direction drawn at random."""
-    outlier_duration: NonNegative = 0.0
+    outlier_duration: Delay = 0.0
     """[s] how long an outlier stays where it is; 0: one frame."""
     occlusions: ShareBelowOne = 0.0
     """[1] share of the frames in which the feature is hidden, at random times."""
-    occlusion_duration: Positive = 0.5
+    occlusion_duration: Annotated[Positive, Usual(10.0)] = 0.5
     """[s] length of each of these occlusions."""
     occlusion_windows: tuple[tuple[Number, Number], ...] = ()
     """[s] further occlusions: begin (included, above 0) and end (excluded) of each."""
-    latency_swing: NonNegative = 0.0
+    latency_swing: Delay = 0.0
     """[s] A: a frame exposed at t is late by A (1 + sin(2π t/P)) in addition to the latency."""
-    swing_period: Positive = 4.0
+    swing_period: Annotated[Positive, Usual(100.0)] = 4.0
     """[s] P of this swing."""
     camera_turn: Annotated[NonNegative, Usual(3.2)] = 0.0
     """[rad/s] the first camera turns about its optical axis, from its pose at the start on."""

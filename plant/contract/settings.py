@@ -68,6 +68,12 @@ NonNegative: TypeAlias = Annotated[float, Ge(0.0), AllowInfNan(False)]
 """A finite number, 0 or above."""
 PositiveOrInfinite: TypeAlias = Annotated[float, Gt(0.0)]
 """A number above 0, or `inf` for no limit."""
+Delay: TypeAlias = Annotated[NonNegative, Usual(2.0)]
+"""A time of a loop, 0 or above [s]."""
+Deviation: TypeAlias = Annotated[Positive, Usual(0.1)]
+"""A standard deviation of a feature in natural units [m]."""
+Duration: TypeAlias = Annotated[Positive, Usual(3600.0)]
+"""Length of a run or a part of it [s]."""
 JointSpeed: TypeAlias = Annotated[Positive, Usual(20.0)]
 """The speed of a joint [rad/s]."""
 Share: TypeAlias = Annotated[float, Ge(0.0), Le(1.0)]
@@ -351,6 +357,7 @@ def _usual(hint: Any) -> float | None:  # noqa: ANN401 - any annotation
 
 
 def _numbers_in(value: object) -> Iterator[float]:
+    value = tuple(np.ravel(value).tolist()) if isinstance(value, np.ndarray) else value
     if isinstance(value, tuple):
         for each in value:
             yield from _numbers_in(each)

@@ -21,7 +21,7 @@ from annotated_types import MinLen
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import File, Names, Numbers, Positive, Values, nested, override, settings
+from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.fmu.description import FmuDescription, total_size
 
@@ -45,11 +45,11 @@ class TruthMapping:
 class JointLimits:
     """Limits of the joints: one number for all of them, or one for each."""
 
-    max_joint_speed: Numbers = field(default_factory=lambda: np.array(1.0))
+    max_joint_speed: Annotated[Numbers, Usual(20.0)] = field(default_factory=lambda: np.array(1.0))
     """[rad/s] commands are clipped to it."""
-    joint_lower: Numbers = field(default_factory=lambda: np.array(-2 * np.pi))
+    joint_lower: Annotated[Numbers, Usual(4 * np.pi)] = field(default_factory=lambda: np.array(-2 * np.pi))
     """[rad]"""
-    joint_upper: Numbers = field(default_factory=lambda: np.array(2 * np.pi))
+    joint_upper: Annotated[Numbers, Usual(4 * np.pi)] = field(default_factory=lambda: np.array(2 * np.pi))
     """[rad]"""
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from servobench.plant.contract.checks import FloatArray, as_array, is_finite, wh
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Names, NonNegative, nested, settings
+from servobench.plant.contract.settings import Delay, Names, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
@@ -50,7 +50,7 @@ Setter = Callable[[Instance, int], None]
 class FmuConfig:
     """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
 
-    command_delay: NonNegative = 0.05
+    command_delay: Delay = 0.05
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""

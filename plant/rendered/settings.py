@@ -9,7 +9,17 @@ from typing import Annotated, Literal
 from annotated_types import Len
 
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Count, JointSpeed, NonNegative, Number, Positive, Usual, nested, settings
+from servobench.plant.contract.settings import (
+    Count,
+    Delay,
+    JointSpeed,
+    NonNegative,
+    Number,
+    Positive,
+    Usual,
+    nested,
+    settings,
+)  # fmt: skip
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.robot import Robot
@@ -26,7 +36,7 @@ class RenderedConfig:
     """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
     joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
     """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
-    lag: Annotated[NonNegative, Usual(1.0)] = 0.05
+    lag: Delay = 0.05
     """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
     drives: DriveConfig = nested(DriveConfig)
     """Loops, torque limits, friction and load of the joints."""
@@ -38,7 +48,7 @@ class RenderedConfig:
     """The same when the arm meets itself; off, as the task `circle` leads the wrist 70 mm into the upper arm."""
     obstacles: tuple[BoxNumbers, ...] = ()
     """[m] boxes that hide the ball and stand in the way: x, y, z of the centre in the base frame, and three sides."""
-    command_delay: NonNegative = 0.0
+    command_delay: Delay = 0.0
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""

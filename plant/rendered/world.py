@@ -111,6 +111,9 @@ class RenderedWorld(World):
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
+        sensing = config.sensing
+        if any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2)) or sensing.outliers > 0.0:
+            self.noise_unit = model.noise_unit  # without noise, features keep their bits
         self._start = as_vector("start", start, self.spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not arm.gear_ratio.all():

@@ -37,9 +37,9 @@ class Tool(NamedTuple):
 class MechanicsConfig:
     """Settings of gears and tool; all off by default."""
 
-    backlash: Annotated[NonNegative, Usual(0.5)] = 0.0
+    backlash: Annotated[NonNegative, Usual(0.2)] = 0.0
     """[rad] b: half of the play between each gear and its joint."""
-    ripple: Annotated[NonNegative, Usual(0.5)] = 0.0
+    ripple: Annotated[NonNegative, Usual(0.2)] = 0.0
     """[rad] a: each gear leads by a sin(k q)."""
     ripple_order: Positive = 8.0
     """[1] k, periods of the ripple in a turn."""

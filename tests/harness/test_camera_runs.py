@@ -13,6 +13,7 @@ import servobench as package
 from kit.command import judged, servobench
 from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
+from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, draw
 from servobench.harness.run.request import RunRequest
@@ -104,6 +105,13 @@ def test_a_folder_is_resumed_with_the_same_camera_only(monkeypatch, capsys):
     capsys.readouterr()
     assert servobench(monkeypatch, *command, "--resume") == 2
     assert "out was begun with another version of mine.toml" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_run_is_shown_through_its_camera():
+    result = run_experiment(request(sensing="position", robot="ur10e with planned.toml"), Settings())
+    shown = logged_run(result.row, result.steps, {})
+    assert shown.robot.pinhole.width == 640
+    np.testing.assert_allclose(shown.ball[-1], shown.reference[-1], atol=0.01)
 
 
 def test_a_challenge_has_the_camera_of_a_file_beside_it(tmp_path):

@@ -82,3 +82,12 @@ def test_pixels_are_pixels_where_features_are():
     assert config.extents("px", 160.0)[:4] == (0.0125, 0.02, 0.00625, 0.05)
     with pytest.raises(ValueError, match=r"sensing.feature_noise is 2px, but the features are in m; write it in m"):
         config.extents("m", 1.0)
+
+
+@pytest.mark.parametrize(
+    "assignment", ["kinematic.lag=5", "kinematic.sensing.latency=3", "kinematic.mechanics.backlash=2", "run.period=5"]
+)
+def test_times_and_angles_of_likely_other_units_are_remarked_on(assignment, caplog):
+    remark.cache_clear()
+    read(assignment)
+    assert f"{assignment.replace('=', ' is ')}, and usually at most" in caplog.text
