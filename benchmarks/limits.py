@@ -26,13 +26,13 @@ def bare_numpy(runs: int) -> float:
     rng, arm, eye, m, n = np.random.default_rng(0), find_robot("ur5").nominal, np.eye(6), 3, 6
     q = np.array(HOME) + 0.05 * rng.normal(size=(runs, n))
     v = sent = np.zeros((runs, n))
-    y, J = arm.feature_and_jacobian(q)
+    y, J, _ = arm.observe(q)
     goal, P = y + 0.1 * rng.normal(size=(runs, m)), np.tile(START * eye, (runs, 1, 1))
     seen_q, seen_y = q, y
     noise = 1e-3 * rng.normal(size=(PERIODS, runs, m))
     began = time.process_time()
     for k in range(PERIODS):
-        y = arm.feature_and_jacobian(q)[0] + noise[k]
+        y = arm.feature(q) + noise[k]
         dq, dy, seen_q, seen_y = q - seen_q, y - seen_y, q, y
         J, P = _learn(J, P, dq, dy, eye)
         gram = J @ J.mT + LAMBDA * eye[:m, :m]

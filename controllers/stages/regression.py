@@ -32,7 +32,7 @@ All functions are pure; the axis of the filters follows the leading axes of runs
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple, TypeAlias, final
+from typing import Final, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from servobench.controllers.algebra import nearest_rotation
 from servobench.controllers.controller import RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import branch, map_arrays, outer, pick
+from servobench.plant.contract.lanes import Tree, branch, map_arrays, outer, pick
 from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
@@ -148,7 +148,7 @@ def learn(
     return learned, Innovation(-known[..., :m], square, s, capped, frames)
 
 
-def of_filter(tree: Any, index: IntArray) -> Any:  # noqa: ANN401 - any tree
+def of_filter(tree: Tree, index: IntArray) -> Tree:
     """Return the part of one filter of a tree of arrays (..., N, *); `index` is (...)."""
     return map_arrays(lambda array: pick(array, index), tree)
 

@@ -1,7 +1,7 @@
 """Decisions and faults of recorded code: C takes one of two ways, as the code did, and reports a fault by its code.
 
 Decisions are those of `plant.contract.lanes`. Numpy code raises where its numbers are of no use. A recorded step cannot
-be left in its middle: it goes on, and returns a code of `MESSAGES` beside its results, 0 for none. Functions that are
+be left in its middle: it goes on, and returns the code of a fault beside its results, 0 for none. Functions that are
 recorded on their own, such as the ways of a branch, collect their faults in a frame each.
 """
 
@@ -20,12 +20,8 @@ from servobench.fmus.trace.arrays import Expression, NotTraceable, Traced, as_tr
 from servobench.plant.contract.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
-NOT_FINITE: Final = 1
-NOT_DEFINITE: Final = 2
-MESSAGES: Final = {
-    NOT_FINITE: "the estimate or the command is not finite",
-    NOT_DEFINITE: "a covariance is not positive definite",
-}
+NOT_FINITE: Final = 1  # code of a fault: the estimate or the command is not finite
+NOT_DEFINITE: Final = 2  # likewise: a covariance is not positive definite
 _NUMBERS = count()
 
 
@@ -82,8 +78,7 @@ def leaves_of(tree: Any) -> list[Any]:  # noqa: ANN401 - any tree
 def with_leaves(tree: Tree, leaves: list[Any]) -> Tree:
     """Return a tree of the same form with other arrays."""
     rest = iter(leaves)
-    renewed: Tree = map_arrays(lambda _: next(rest), tree)
-    return renewed
+    return map_arrays(lambda _: next(rest), tree)
 
 
 def symbols_like(leaves: list[Any]) -> list[Traced]:
@@ -139,8 +134,7 @@ def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *ar
         branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
         for lane in np.ndindex(chosen.shape)
     ]
-    stacked: Tree = map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
-    return stacked
+    return map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
 
 
 def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:

@@ -132,7 +132,7 @@ class Recorded:
 
     Attributes:
         start: CasADi function u -> x, code.
-        step: CasADi function x, u -> x, y, code; a code that is not 0 is one of `branches.MESSAGES`.
+        step: CasADi function x, u -> x, y, code; a code that is not 0 is that of a fault, as in `branches`.
     """
 
     start: Any

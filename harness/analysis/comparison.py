@@ -12,12 +12,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.statistics import (
-    Difference,
-    Estimate,
-    paired_difference,
-    success_rate,
-)
+from servobench.harness.analysis.statistics import Difference, Estimate, paired_difference, success_rate
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED

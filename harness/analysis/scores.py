@@ -41,19 +41,6 @@ class Ranked:
     lost: float
 
 
-@dataclass(frozen=True)
-class Resolution:
-    """How far two random halves of the robots agree; the full set resolves differences half as large.
-
-    Attributes:
-        difference: median over splits and methods of the absolute difference of interquartile means.
-        correlation: mean over splits of Spearman's correlation of the two rankings; NaN where all methods are equal.
-    """
-
-    difference: float
-    correlation: float
-
-
 def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray:
     """Return min(1, max(reference, floor) / max(own, floor)) of each run.
 
@@ -76,27 +63,18 @@ def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray
         return np.asarray(np.where(np.isinf(known), 0.0, np.minimum(1.0, bound / known)))
 
 
-def interquartile_means(table: pd.DataFrame) -> dict[str, Estimate]:
-    """Return the mean of the middle half of each method's scores over challenges and robots, best first.
-
-    The interval is that of a percentile bootstrap that draws robots anew within each challenge, as rliable does.
-
-    Raises:
-        ValueError: no run, a method without a score on a robot of the others, or two scores on one.
-    """
-    means, drawn = _means_with_resamples(_by_robot(table, "score"))
-    return _estimates(means, drawn, len(table) // len(means))
-
-
 def ranking(table: pd.DataFrame) -> list[Ranked]:
     """Return the methods by interquartile mean; those that cannot be told apart share a rank.
+
+    The mean is that of the middle half of the scores over challenges and robots, its interval that of a percentile
+    bootstrap that draws robots anew within each challenge, as rliable does.
 
     Two methods are told apart where the difference of their interquartile means, over its standard deviation in
     resamples of the same robots, is significant at 5 % after Holm's correction over all pairs. A rank is shared by the
     methods that cannot be told apart from the best one in it.
 
     Raises:
-        ValueError: as `interquartile_means`.
+        ValueError: no run, a method without a score on a robot of the others, or two scores on one.
     """
     by_robot = _by_robot(table, "score")
     means, drawn = _means_with_resamples(by_robot)
@@ -121,7 +99,7 @@ def profile(table: pd.DataFrame, factors: Sequence[float]) -> pd.DataFrame:
         A row for each factor, a column for each controller.
 
     Raises:
-        ValueError: a factor below 1, or as `interquartile_means`.
+        ValueError: a factor below 1, or as `ranking`.
     """
     if min(factors, default=1.0) < 1.0:
         raise ValueError(f"factors must be at least 1, got {min(factors)}")
@@ -131,13 +109,13 @@ def profile(table: pd.DataFrame, factors: Sequence[float]) -> pd.DataFrame:
     return pd.DataFrame(rows, index=pd.Index(factors, name="factor"))
 
 
-def resolution(table: pd.DataFrame) -> Resolution:
-    """Return how far the interquartile means and ranks of two random halves of the robots agree.
+def resolution(table: pd.DataFrame) -> float:
+    """Return the median difference of the interquartile means of a method on two random halves of the robots.
 
-    A robot is in the same half in all challenges, and each challenge is halved.
+    A robot is in the same half in all challenges, and each challenge is halved. All robots resolve about half of it.
 
     Raises:
-        ValueError: a challenge with fewer than two robots, or as `interquartile_means`.
+        ValueError: a challenge with fewer than two robots, or as `ranking`.
     """
     by_robot = _by_robot(table, "score")
     values, generator = by_robot.to_numpy().T, np.random.default_rng(0)
@@ -146,7 +124,7 @@ def resolution(table: pd.DataFrame) -> Resolution:
     rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
     if min(map(len, rows)) < 2:
         raise ValueError("a ranking is split into halves: each challenge needs at least two robots")
-    differences, correlations = [], []
+    differences = []
     for _ in range(SPLITS):
         order = generator.permutation(count)[numbers]
         shuffled = [own[np.argsort(order[own])] for own in rows]
@@ -155,9 +133,7 @@ def resolution(table: pd.DataFrame) -> Resolution:
             for half in ([own[: len(own) // 2] for own in shuffled], [own[len(own) // 2 :] for own in shuffled])
         )
         differences.append(np.abs(first - second))
-        correlations.append(pd.Series(first).rank().corr(pd.Series(second).rank()))
-    known = np.array(correlations)[~np.isnan(correlations)]
-    return Resolution(float(np.median(differences)), float(known.mean()) if len(known) else np.nan)
+    return float(np.median(differences))
 
 
 def _by_robot(table: pd.DataFrame, column: str, *, lost: bool = False) -> pd.DataFrame:

@@ -232,7 +232,8 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             row = {"controller": str(name), "outcome": _shares(own)}
             for column, summary in summaries:
                 heading = metric_heading(column, place)
-                row[heading] = _middle(own, column, shown_unit(column, place)[1], summary.digits)
+                middle = shown_unit(column, place)[1] * column_of(own, column).median()
+                row[heading] = number(middle, f".{summary.digits}f")
                 if column == STEP_TIME and _is_late(own):
                     row[heading] += LATE
             rows.append(row)
@@ -261,7 +262,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
         sums = place.assign(good=good).groupby(keys[2:], sort=False)[["good", "runs"]].sum()
-        table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
+        table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(number, spec=".1f")
         table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
         word = FOLLOWED if task in curves else SETTLED
         shares = table.rename_axis(columns=None).reset_index()
@@ -270,12 +271,8 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         yield f"{task} on {plant}: {word} [%]", shares
         if good.sum() < place["runs"].sum():
             kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
-            table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
+            table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(number, spec=".1f")
             yield f"{task} on {plant}: outcomes of the runs [%]", table.rename_axis(columns=None).reset_index()
-
-
-def _percent(value: float) -> str:
-    return MISSING if pd.isna(value) else f"{value:.1f}"
 
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
@@ -293,11 +290,6 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
 def _is_late(runs: pd.DataFrame) -> bool:
     """Return whether a step of a controller took longer than the control period."""
     return bool((column_of(runs, "controller_time_overruns") > 0.0).any())
-
-
-def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:
-    value = column_of(runs, name).median()
-    return MISSING if pd.isna(value) else f"{factor * value:.{digits}f}"
 
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about

@@ -39,7 +39,6 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
-LEVEL: Final = 0.05  # of significance
 NOBODY: Final = "nobody"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
 NAMED, MANY = 3, 6  # controllers that a sentence names at most

@@ -50,16 +50,15 @@ class Rig(Plant):
         conditions: of the runs.
     """
 
-    def __init__(self, n: int, m: int, seed: int = 0) -> None:
+    def __init__(self, n: int, m: int) -> None:
         """Make the arm.
 
         Args:
             n: number of joints.
             m: number of features.
-            seed: of the arm's numbers.
         """
         self.conditions = Conditions()
-        rng = np.random.default_rng([n, m, seed])
+        rng = np.random.default_rng([n, m, 0])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
         self.start, self.goal = rng.uniform(-0.5, 0.5, (2, n))

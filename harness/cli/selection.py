@@ -81,14 +81,15 @@ def _mismatches() -> Names:
 
 
 def _robots() -> Names:
-    from servobench.harness.config.robots import find_robot, robot_names
+    from servobench.harness.config.robots import find_robot
+    from servobench.plant.robot.catalogue import ROBOTS
 
     def find(word: str) -> str:
         if note := find_robot(word).note:
             say(note)
         return word
 
-    return Names(robot_names, find)
+    return Names(lambda: list(ROBOTS), find)
 
 
 def _sensings() -> Names:
@@ -100,10 +101,7 @@ def _sensings() -> Names:
 def _challenges() -> Names:
     from servobench.harness.studies.challenge import challenge_names, find_challenge
 
-    def find(word: str) -> None:
-        find_challenge(word)
-
-    return Names(challenge_names, find)
+    return Names(challenge_names, find_challenge)
 
 
 KINDS: Final[dict[str, Callable[[], Names]]] = {

@@ -18,11 +18,6 @@ DEFAULT_ROBOT: Final = ur5.UR5
 OWN_ROBOT: Final = "own"  # in the column `robot`: the plant brings it
 
 
-def robot_names() -> list[str]:
-    """Return the names of all robots that are known without a file."""
-    return list(catalogue.ROBOTS)
-
-
 def find_robot(name: str) -> Robot:
     """Return the robot that a name or the path of a file stands for.
 

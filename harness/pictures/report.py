@@ -37,14 +37,7 @@ from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.pictures.figures import KINDS, page_figures
-from servobench.harness.pictures.style import (
-    NARROW,
-    WIDE,
-    Drawing,
-    MethodStyle,
-    drawing_of,
-    method_styles,
-)
+from servobench.harness.pictures.style import NARROW, WIDE, Drawing, MethodStyle, drawing_of, method_styles
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, load_tables, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS

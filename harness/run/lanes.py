@@ -68,8 +68,7 @@ class Ends:
             spread[self.running] = values
             return spread
 
-        all_lanes: Tree = tree if len(self.running) == self.count else map_arrays(placed, tree, before)
-        return all_lanes
+        return tree if len(self.running) == self.count else map_arrays(placed, tree, before)
 
 
 class _Member:

@@ -167,7 +167,7 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             own = own[own["plant"] == plant]
             title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
-                title += f"; halves of the robots differ by {resolution(own).difference:.3f} in the score"
+                title += f"; halves of the robots differ by {resolution(own):.3f} in the score"
             yield title, place.drop(columns="plant")
 
 

@@ -56,32 +56,14 @@ def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
     return as_array(name, value, (size,))
 
 
-def check_number(
-    name: str,
-    value: float,
-    *,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    below: float = math.inf,
-) -> None:
-    """Check a configured number against its bounds.
-
-    Args:
-        name: name of the argument, for the error message.
-        value: the number that came.
-        above: it must be greater than this.
-        at_least: it must not be less than this.
-        at_most: it must not be greater than this.
-        below: it must be less than this.
+def check_number(name: str, value: float, *, above: float) -> None:
+    """Check that a number is finite and greater than `above`.
 
     Raises:
-        ValueError: not finite, or out of bounds; names the argument, the wanted and the given value.
+        ValueError: it is not; names the argument, the wanted and the given value.
     """
-    if not (math.isfinite(value) and above < value < below and at_least <= value <= at_most):
-        bounds = {"above": above, "at least": at_least, "at most": at_most, "below": below}
-        wanted = [f"{word} {bound:g}" for word, bound in bounds.items() if math.isfinite(bound)]
-        raise ValueError(f"{name} must be {' and '.join(wanted) or 'finite'}, got {value}")
+    if not above < value < math.inf:
+        raise ValueError(f"{name} must be above {above:g}, got {value}")
 
 
 def whole_steps(period: float, own_step: float) -> int:

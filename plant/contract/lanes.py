@@ -26,25 +26,24 @@ Tree = TypeVar("Tree")
 Lanes = Any  # an index of the leading axes
 
 
-def map_arrays(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
+def map_arrays(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
     """Return the tree with `function` applied to its arrays, and to those at the same place of the other trees."""
+    mapped: Tree = tree
     if isinstance(tree, (np.ndarray, np.generic)):  # numpy makes numbers of arrays without axes
-        return function(tree, *others)
-    if isinstance(tree, tuple):
-        entries = [map_arrays(function, *each) for each in zip(tree, *others, strict=True)]
-        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        new = object.__new__(type(tree))
+        mapped = function(tree, *others)
+    elif isinstance(tree, tuple):
+        make: Any = getattr(tree, "_make", tuple)
+        mapped = make([map_arrays(function, *each) for each in zip(tree, *others, strict=True)])
+    elif is_dataclass(tree) and not isinstance(tree, type):
+        mapped = object.__new__(type(tree))
         for name in (field.name for field in fields(tree)):
-            object.__setattr__(new, name, map_arrays(function, *(getattr(each, name) for each in (tree, *others))))
-        return new
-    return tree
+            object.__setattr__(mapped, name, map_arrays(function, *(getattr(each, name) for each in (tree, *others))))
+    return mapped
 
 
 def take(tree: Tree, lanes: Lanes) -> Tree:
     """Return a tree with the indexed lanes; a single number gives the tree of a single run."""
-    taken: Tree = map_arrays(lambda array: array[lanes], tree)
-    return taken
+    return map_arrays(lambda array: array[lanes], tree)
 
 
 def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
@@ -57,14 +56,12 @@ def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
         new[lanes] = values
         return new
 
-    changed: Tree = map_arrays(replaced, tree, part, before)
-    return changed
+    return map_arrays(replaced, tree, part, before)
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
     """Return the trees of single runs as one with a leading axis; values other than arrays are those of the first."""
-    stacked: Tree = map_arrays(lambda *arrays: np.stack(arrays), *trees)
-    return stacked
+    return map_arrays(lambda *arrays: np.stack(arrays), *trees)
 
 
 def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401

@@ -52,7 +52,7 @@ STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, th
 
 
 # MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
-KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="{fuse}" strippath="true"/></mujoco>'
+KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="false" strippath="true"/></mujoco>'
 
 
 def renderer_name() -> str:
@@ -382,21 +382,19 @@ def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
     return model, {model.geom(box.name).id: box.name for box in boxes}
 
 
-def read_urdf(text: str, meshes: Mapping[str, str] | None = None, *, fuse: bool = False) -> Any:  # noqa: ANN401
+def read_urdf(text: str, meshes: Mapping[str, str] | None = None) -> Any:  # noqa: ANN401
     """Return the editable model, an `MjSpec`, of a URDF.
 
     Args:
         text: the URDF.
         meshes: Wavefront OBJ text by the file names in the URDF; other files are left alone.
-        fuse: join links that a fixed joint connects: a step takes less time, and they lose their names.
 
     Raises:
         ValueError: MuJoCo cannot read it.
     """
     head, tag, rest = text.partition(">")
-    keep = KEEP_ALL.format(fuse=str(fuse).lower())
     spec = mujoco.MjSpec.from_string(
-        f"{head}{tag}{keep}{rest}", assets={name: mesh.encode() for name, mesh in (meshes or {}).items()}
+        f"{head}{tag}{KEEP_ALL}{rest}", assets={name: mesh.encode() for name, mesh in (meshes or {}).items()}
     )
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a flat one has no volume

@@ -72,10 +72,6 @@ class RobotModel(ABC):
     def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
         """Return `feature`, `jacobian` and `valid`, all read-only, at the cost of one forward kinematics."""
 
-    def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `feature` and `jacobian`, both read-only."""
-        return self.observe(joint_position)[:2]
-
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the true features, (..., m), for joint positions (..., n) in rad."""
         return self.observe(joint_position)[0]

@@ -172,7 +172,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert written == again
     (tuned,) = written.values()
     assert read_tuned(tmp_path / "one" / "broyden.published.toml") == tuned
-    assert tuned.tuning_set() == SMALL
+    assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == SMALL
     assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (16, 48)
     assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [(0, 2, 1), (1, 2, 1)]
     on_second = [tuned.second_score_of_defaults, *(each.second_score for each in tuned.studies)]

@@ -140,7 +140,7 @@ def test_what_a_model_hands_out_cannot_be_changed():
     model = HandEyeModel(ur5_arm(), pose)
     pose[0, 3] = 1.0
     assert model.X_BC[0, 3] == 0.0
-    assert not any(array.flags.writeable for array in (model.X_BC, *model.feature_and_jacobian(np.zeros(6))))
+    assert not any(array.flags.writeable for array in (model.X_BC, *model.observe(np.zeros(6))[:2]))
 
 
 def test_offsets_and_gear_ratios_act_on_the_reported_position():

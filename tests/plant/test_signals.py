@@ -51,11 +51,10 @@ def test_a_spec_is_checked(change, message):
 
 
 def test_a_number_is_held_against_its_bounds():
-    check_number("x", 1.0, above=0.0, at_most=1.0)
-    with pytest.raises(ValueError, match="x must be above 0 and at most 1, got 2"):
-        check_number("x", 2, above=0.0, at_most=1.0)
-    with pytest.raises(ValueError, match="x must be finite, got inf"):
-        check_number("x", np.inf)
+    check_number("x", 0.1, above=0.0)
+    for value in (0.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match=f"x must be above 0, got {value}"):
+            check_number("x", value, above=0.0)
 
 
 def test_a_period_is_a_whole_number_of_own_steps():

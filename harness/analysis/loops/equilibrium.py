@@ -230,8 +230,7 @@ class Packing:
             begin, place = place, place + array.size
             return x[:, begin:place].reshape(len(x), *array.shape)
 
-        full: ServoState = map_arrays(filled, self._state)
-        return full
+        return map_arrays(filled, self._state)
 
     def pack(self, state: ServoState, lanes: int) -> FloatArray:
         """Return the numbers of runs side by side, (lanes, s); with 0 lanes those of a single run, (1, s)."""

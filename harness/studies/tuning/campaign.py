@@ -254,10 +254,6 @@ class TunedValues:
     studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
     edges: tuple[str, ...] = ()  # a line for each number at an edge of its box, which is wider in the next study
 
-    def tuning_set(self) -> TuningSet:
-        """Return the runs on which the values were found."""
-        return TuningSet(self.plants, self.robots, self.offset)
-
 
 def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
     """Return a line for each of a controller's numbers that lies at an edge of the box in which it was searched."""
