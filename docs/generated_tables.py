@@ -56,7 +56,12 @@ from servobench.harness.config.settings import flatten
 from servobench.harness.run.metrics import METRICS
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    ROOT / "fmus" / "ur5_mismatched" / "readme.md",
+]
 PART = re.compile(
     r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options|install|attributes|interface): "
     r"(\S+) -->\n)(.*?)(<!-- end -->)",
@@ -65,7 +70,7 @@ PART = re.compile(
 RELEASED = False  # whether a release is on a package index, from which all pages then install
 NEW_LINE = "\n"
 LINE = 120  # letters
-SETTING = ("setting", "default", "unit", "allowed", "meaning")
+SETTING = ("setting [unit]", "default", "allowed", "meaning")
 
 
 def main() -> None:
@@ -119,8 +124,8 @@ def options_table() -> str:
             if option.param_type_name == "option":
                 words = "`" + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip() + "`"
                 owners.setdefault((words, option.help.replace("\\[", "[").replace("<", "\\<")), []).append(name)
-    rows = [(words, meaning, ", ".join(names)) for (words, meaning), names in owners.items() if len(names) > 1]
-    return table(("option", "meaning", "commands"), rows)
+    rows = [key for key, names in owners.items() if len(names) > 1]
+    return table(("option", "meaning"), rows)
 
 
 def methods_table() -> str:
@@ -233,7 +238,7 @@ def settings_table(kinds: dict[str, type[Any]]) -> str:
         return table(SETTING, list(owners))
     names = {row: "all" if len(found) == len(kinds) else ", ".join(found) for row, found in owners.items()}
     shared_first = sorted(owners, key=lambda row: -len(owners[row]))
-    return table(("setting", "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first])
+    return table((SETTING[0], "of", *SETTING[1:]), [(row[0], names[row], *row[1:]) for row in shared_first])
 
 
 def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
@@ -251,7 +256,8 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
             continue
         if not each.meaning:
             raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
-        yield (f"`{each.key}`", toml(each.value), each.unit, each.allowed, each.meaning)
+        unit = f" [{each.unit}]" if each.unit else ""
+        yield (f"`{each.key}`{unit}", toml(each.value), each.allowed, each.meaning)
 
 
 def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any settings

@@ -90,8 +90,8 @@ def test_everything_registered_has_a_row_and_nothing_else_has():
 def installed(tmp_path, monkeypatch):
     """Installs the example of a page as pip would: its module and its entry points on the path."""
 
-    def install_example(text):
-        project, code = tomllib.loads(blocks(text, "toml")[0])["project"], blocks(text, "python")[0]
+    def install_example(toml, code):
+        project = tomllib.loads(toml)["project"]
         module = project["name"].replace("-", "_")
         points = [
             f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in entries.items())
@@ -116,7 +116,7 @@ def installed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("controller", ["nominal_rate", "nominal_broyden"])
 def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, controller):
-    installed(section(read("own_controller.md"), "As a distribution"))
+    installed(read("examples/nominal-rate/pyproject.toml"), read("examples/nominal-rate/nominal_rate.py"))
     assert controller in registry.controller_names()
     request = RunRequest("kinematic", controller, "exp2", "moderate", 3)
     settings = read_settings(None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"])
@@ -127,7 +127,7 @@ def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, contro
 
 
 def test_the_plant_of_the_example_closes_a_loop(installed):
-    installed(section(read("plants.md"), "Your own plant"))
+    installed(read("examples/planar/pyproject.toml"), read("examples/planar/planar.py"))
     settings = read_settings(None, ["rls.initial.source=probe", "target.target=[0.2, 0.7]"])
     row = run_experiment(RunRequest("planar", "rls", "target", "none", 0), settings).row
     assert row["status"] == "completed"

@@ -53,15 +53,15 @@ def test_all_settings_have_a_table_and_nothing_else_has():
 
 def test_a_section_with_a_table_of_its_own_is_not_printed_again():
     shown = generated_tables.settings_table({"bullet": registry.find_plant("bullet").config})
-    assert "`sensing.latency` | 0.05" in shown  # which differs from the default of the section
+    assert "`sensing.latency` [s] | 0.05" in shown  # which differs from the default of the section
     assert "sensing.noise_share" not in shown
 
 
 def test_a_setting_that_several_classes_share_stands_once_and_names_those_that_have_it():
     laws = {name: LAWS[name].config for name in ("mfac", "pid")}
     both = generated_tables.settings_table({"one": laws["mfac"], "two": laws["mfac"], "three": laws["pid"]})
-    assert both.count("| `gain` | `one`, `two` | ") == 1
-    assert both.count("| `proportional_gain` | `three` | ") == 1
+    assert both.count("| `gain` [1/s] | `one`, `two` | ") == 1
+    assert both.count("| `proportional_gain` [1/s] | `three` | ") == 1
     assert generated_tables.settings_table({"a": laws["pid"], "b": laws["pid"]}).count(" | all | ") == 5
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,7 @@ import pytest
 import generated_tables
 from kit import console
 from kit.command import PACKAGE
-from kit.documents import DOCS, blocks, read
+from kit.documents import DOCS, ROOT, blocks, read
 from kit.nightly import NIGHTLY
 from kit.robots import calibration_text, odd_urdf
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
@@ -88,6 +89,7 @@ def lay_out(shell):
     """Make the files that a reader has of their own."""
     (shell.folder / "my_ur10e.yaml").write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
     (shell.folder / "my_arm.urdf").write_text(re.sub(r"\bhand\b", "tool0", odd_urdf()))
+    shutil.copytree(ROOT / "docs" / "examples" / "nominal-rate", shell.folder / "nominal-rate")
     shell.paste("shell", "servobench fmu export -o mine.fmu\nservobench run --plant kinematic --out logged")
     pd.read_parquet(shell.folder / "logged" / "steps.parquet").to_csv(shell.folder / "robot.csv", index=False)
 
