@@ -3,8 +3,6 @@
 The checks are those of the archive and the description (by fmpy), and a run against the reference inside it.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
 """
 
-from __future__ import annotations
-
 import hashlib
 import html
 import os

@@ -1,7 +1,5 @@
 """Export of the steps of runs: as CSV, and as MCAP for Foxglove and other readers."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Describes a results folder in words, and reads its further tables."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final

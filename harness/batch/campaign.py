@@ -6,8 +6,6 @@ out the runs without a part, so that its tables are those of an undisturbed one,
 when they are needed, so that the memory of this process does not grow with their number.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

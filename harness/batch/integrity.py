@@ -1,7 +1,5 @@
 """The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

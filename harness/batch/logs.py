@@ -1,7 +1,5 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables in Parquet files with a checksum a page: written, read, and put together while few rows are in memory."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import math

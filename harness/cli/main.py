@@ -1,7 +1,5 @@
 """The command `servobench`."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import faulthandler

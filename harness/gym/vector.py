@@ -1,7 +1,5 @@
 """Runs side by side as a vector environment of Gymnasium: one plant with a lane for each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, cast, final
 

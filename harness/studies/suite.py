@@ -8,8 +8,6 @@ A run is lost if it does not settle, on a curve if it is not followed. A challen
 `MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Atomic writing of files, and reading of TOML with errors of one line."""
 
-from __future__ import annotations
-
 import os
 import re
 import threading
