@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -260,7 +261,7 @@ def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:
 
 
 def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
-    """Refuse a table of runs in which a run is not identified, or its identifier is unfit for the name of a file.
+    """Refuse a table of runs in which a run is not identified, or not fit for the name of a file, or a number is -inf.
 
     Raises:
         ConfigurationError: names the table, the column and the row.
@@ -268,6 +269,9 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     for name in NEEDED["runs"]:
         if (empty := runs[name].isna()).any():
             raise ConfigurationError(f"{path} is no table of runs: row {int(empty.to_numpy().argmax())} has no {name}")
+    for name in NUMBERS.intersection(runs.columns):
+        if (runs[name] == -math.inf).any():
+            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number -inf")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(

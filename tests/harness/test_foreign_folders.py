@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import matplotlib.font_manager  # noqa: F401 - fills its cache before anything is noted
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
 
 from kit.command import servobench
-from kit.folders import MANIFEST, comparison, made_up_row, made_up_steps
+from kit.folders import MANIFEST, comparison, made_up_row, made_up_steps, write_folder
 from servobench.harness.batch import results, tables
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.checksums import SUMS, write_vouched
@@ -165,6 +166,11 @@ BOMB = pa.table({f"x{index}": pa.nulls(10**6, pa.float64()) for index in range(3
 WRONG = {
     "texts for numbers": (lambda runs: runs.assign(rms_error="much"), "has (large_)?string in the column rms_error"),
     "numbers for texts": (lambda runs: runs.assign(controller=1), "has int64 in the column controller, where texts"),
+    "no number that a metric has": (
+        lambda runs: runs.assign(overshoot=-np.inf),
+        "the column overshoot has the number -inf",
+    ),
+    "a run twice": (lambda runs: pd.concat([runs, runs, runs.assign(controller="b")]), "constant has several runs of"),
     "names of two lines": (lambda runs: runs.assign(**{"a\nb": 1}), "a name that cannot be printed"),
     "too many columns": (
         lambda runs: pd.concat([runs, pd.DataFrame(0, runs.index, [f"x{i}" for i in range(10_001)])], axis=1),
@@ -180,11 +186,18 @@ def test_a_table_of_wrong_columns_is_one_line(kind, tmp_path, monkeypatch, capsy
     change, words = WRONG[kind]
     changed = change(results.load_runs(folder))
     write_vouched(folder, {results.RUNS: changed.to_parquet})
-    for command in ("statistics", "report"):
+    for command in ("statistics",) if kind == "a run twice" else ("statistics", "report"):
         assert servobench(monkeypatch, command, str(folder)) == 2
         error = capsys.readouterr().err
         assert re.search(words, error), error
         assert error.count("\n") == 1
+
+
+def test_controllers_that_share_no_seed_are_no_pair(tmp_path, monkeypatch, capsys):
+    rows = [made_up_row(f"{name}-{seed}", controller=name, seed=seed) for name, seed in (("a", 0), ("b", 1))]
+    write_folder(tmp_path / "folder", rows, [])
+    assert servobench(monkeypatch, "statistics", str(tmp_path / "folder")) == 0
+    assert "a − b" not in capsys.readouterr().out
 
 
 def test_empty_columns_of_numbers_have_the_type_of_numbers():
