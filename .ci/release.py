@@ -1,5 +1,7 @@
 """Builds a release from its commit, checks both files, installs each alone in a fresh environment and makes a run.
 
+The packages that are installed with it, and their licences, are listed beside the wheel (CycloneDX).
+
     python .ci/release.py [--dist dist] [--python python3.13] [--rehearse]
 
 The commit of version X.Y.Z has the tag vX.Y.Z; any other commit, and a checkout with changes, is refused. `--rehearse`
@@ -9,6 +11,7 @@ builds the checkout as it is. The files for an upload are left in the folder of 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -40,6 +43,8 @@ IN_SOURCE = (
     "requirements.lock",
     "tests/conftest.py",
 )
+LISTER = "cyclonedx-bom==7.5.0"
+LICENCES = {"FMPy": "BSD-2-Clause"}  # read in the files of packages whose metadata states none
 RUN = ("run", "--plant", "kinematic", "--set", "exp2.duration=1", "--out")
 
 
@@ -61,6 +66,9 @@ def main() -> None:
             quiet(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *words, str(file))
             print(f"{file.name}: installed in {time.monotonic() - began:.0f} s, {describe(python)}")  # noqa: T201
             rehearse(python, Path(folder) / f"run of {file.name}")
+        bill = list_packages(python, Path(folder) / "tools", wheel.with_suffix(".cdx.json"))
+        end_with(faults_of_licences(bill))
+        print(f"{bill.name}: the packages that are installed with the release, with their licences")  # noqa: T201
     print(f"release: {wheel.name} and {source.name} install and run from the files alone")  # noqa: T201
 
 
@@ -153,6 +161,30 @@ def fresh_environment(python: str, folder: Path) -> Path:
     """Make an empty environment below a folder and return its interpreter."""
     subprocess.run([python, "-m", "venv", str(folder / "environment")], check=True)
     return folder / "environment" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def list_packages(python: Path, folder: Path, path: Path) -> Path:
+    """Write the packages of an environment as CycloneDX, by a tool in an environment of its own; return the path."""
+    folder.mkdir()
+    tool = fresh_environment(str(python), folder)
+    quiet(tool, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", LISTER)
+    words = (
+        "--output-reproducible",
+        "--validate",
+        "--pyproject",
+        str(ROOT / "pyproject.toml"),
+        "-o",
+        str(path.resolve()),
+    )
+    quiet(tool, "-m", "cyclonedx_py", "environment", *words, str(python))
+    return path
+
+
+def faults_of_licences(bill: Path) -> list[str]:
+    """Return the packages of a CycloneDX file that state no licence, unless it was read in their files."""
+    parts = json.loads(bill.read_text(encoding="utf-8"))["components"]
+    nameless = [each["name"] for each in parts if not each.get("licenses") and each["name"] not in LICENCES]
+    return [f"{name} states no licence; read its files and add it to LICENCES" for name in nameless]
 
 
 def describe(python: Path) -> str:

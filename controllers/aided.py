@@ -9,8 +9,6 @@ The regression on the nominal Jacobian stands in the estimator's place. The cont
     knowledge.nominal_jacobian   J(q) = J_n(q) + Ĵ(q̂) − J_n(q̂); J_n(q) before the first step, as in the constructor
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial

@@ -7,8 +7,6 @@ and in its type a `Switch` with the value that a best equipped method has and th
 of methods, the study of the aids and the spaces of tuning are made from these declarations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_type_hints

@@ -1,7 +1,5 @@
 """Linear algebra of the chain: damped pseudo-inverse, projection on the row space, and nearest rotation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray

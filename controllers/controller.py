@@ -7,8 +7,6 @@ a Jacobian estimator and a control law composed by `servobench.controllers.servo
 derives from `Controller`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy

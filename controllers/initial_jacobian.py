@@ -7,8 +7,6 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
     Ĵ₀ = ΔY ΔQ⁺
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, final
 

@@ -1,7 +1,5 @@
 """A second upper bound: nonlinear predictive control over the kinematics of the true robot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import Any, Final, Literal, final

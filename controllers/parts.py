@@ -1,7 +1,5 @@
 """Estimators and control laws by name; a new part is one row and then works with every part of the other kind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar

@@ -1,7 +1,5 @@
 """Times in control periods, and rows of a preview at instants between the control instants."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray

@@ -7,8 +7,6 @@ stages are the aids (`servobench.controllers.aids`). `Servo` is the pure composi
 `ServoController` holds the state of one run.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, final
 
 import numpy as np

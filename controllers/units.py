@@ -5,8 +5,6 @@
 With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the optical axis.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiles the C sources of an FMU with the system's C compiler for this machine, or with zig for other platforms."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import platform

@@ -1,7 +1,5 @@
 """Exports a controller as a co-simulation FMU: a recorded step, its variables, its reference run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Exports an arm with mismatched kinematics as an FMU."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, field
 from functools import cache

@@ -3,8 +3,6 @@
 The checks are those of the archive and the description (by fmpy), and a run against the reference inside it.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -107,14 +105,26 @@ def validate_fmu(path: Path) -> Validation:
     description = read_description(path, root)
     problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
     deviation = None
-    if (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file():
-        try:
+    referenced = (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file()
+    try:
+        if referenced:
             deviation = _deviation(description, root)
-        except (FmuError, ValueError) as error:
-            problems.append(f"the reference run failed: {error}")
+        else:
+            _make_ready(description, root)
+    except (FmuError, ValueError) as error:
+        problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
     if deviation is not None and not deviation <= TOLERANCE:
         problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
     return Validation(tuple(problems), deviation)
+
+
+def _make_ready(description: FmuDescription, root: Path) -> None:
+    """Load the FMU, instantiate and initialise it, and end it again."""
+    instance = open_instance(description, root)
+    try:
+        instance.start(0.0)
+    finally:
+        instance.close()
 
 
 def _deviation(description: FmuDescription, root: Path) -> float:

@@ -4,8 +4,6 @@ The dependencies of the unknowns are explicit (`Section`). The text holds no dat
 give equal bytes.
 """
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping

@@ -3,8 +3,6 @@
 Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
 """
 
-from __future__ import annotations
-
 import hashlib
 import html
 import os
@@ -224,5 +222,7 @@ def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "model
                 archive.writestr(entry, contents[inside], compresslevel=9)
         Path(name).chmod(0o644)
         Path(name).replace(path)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {reason(error)}") from error
     finally:
         Path(name).unlink(missing_ok=True)

@@ -1,7 +1,5 @@
 """The reference run inside every exported FMU: random commands, and the outputs that numpy computes for them."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping

@@ -9,8 +9,6 @@ only, of the states s = [q, q̇, δ, w], parameters p and the play c, by which j
     arm_forward   s, p, c, ṡ, ṗ -> (ẏ, J̇), …   forward derivatives along (ṡ, ṗ), of the rates as well
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable, Mapping
 from functools import cache

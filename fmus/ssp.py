@@ -1,7 +1,5 @@
 """Writes a plant, a controller and their connections as one file of SSP 1.0 (System Structure and Parameterization)."""
 
-from __future__ import annotations
-
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """The plant `fmu`: the exported arm, built on first use and kept in the user's cache folder."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path

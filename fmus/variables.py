@@ -6,8 +6,6 @@ Every variable is a group of numbers in row-major order. FMI 2 shows each number
 group as an array, `lag`. Both use the group's offset in one flat vector of values as value reference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

@@ -9,8 +9,6 @@ or, with `overshoot`, through one of second order: v̈ = ω² (u − v) − 2ζ�
 Delay, noise, latency and lost frames are those of `servobench.plant.bench.bench`.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache, partial
 from typing import Annotated, NamedTuple

@@ -1,7 +1,5 @@
 """The estimators that learn nothing, the bounds of every comparison: the first Jacobian, and the true one."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, final
 
 import numpy as np

@@ -12,8 +12,6 @@ size mn in the papers thus split exactly into rows; only the weights may couple 
 A weight of 0 leaves the row as it was. As b grows without limit all of them become the Kalman filter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Final, NamedTuple

@@ -4,8 +4,6 @@ Estimators are pure: the state goes in and comes out, a tree of arrays with lead
 no array of it is ever changed. One run has no leading axis; a thousand runs have one.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, TypeVar

@@ -9,8 +9,6 @@ The measurement is linear in x, so this filter and the unscented one of `control
 With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, one a feature, that share one covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias, final
 

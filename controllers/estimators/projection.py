@@ -11,8 +11,6 @@ M. Jägersand, O. Fuentes, R. Nelson, 1997. Z. Hou, S. Jin, "Model Free Adaptive
 pseudo-Jacobian by the projection algorithm with reset.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, NamedTuple, final
 
 import numpy as np

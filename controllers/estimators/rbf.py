@@ -4,8 +4,6 @@
 PID, by a Lyapunov update (eqs. 40–44).
 """
 
-from __future__ import annotations
-
 from typing import Annotated, NamedTuple, final
 
 import numpy as np

@@ -6,8 +6,6 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 λ = 1 is batch least squares.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, final
 
 import numpy as np

@@ -24,8 +24,6 @@ Uncalibrated Visual Servoing", ICRA 2010, there from a memory of motions; of a K
 Kalman Filter Based on a Generalized Maximum-Likelihood-Type Estimator", IEEE Trans. Signal Process. 58 (2010) 2509.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple, final
 
 import numpy as np

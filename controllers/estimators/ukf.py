@@ -13,8 +13,6 @@ Merwe's scaled sigma points, 2s+1 of them, with Λ = α²(s + κ) − s and L L�
 multiples of the identity it even splits by rows: the form "split" gives the same numbers for a small part of the cost.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal

@@ -4,8 +4,6 @@ Laws are pure, as estimators are: the state goes in and comes out, a tree of arr
 (`servobench.plant.contract.lanes`), and no array of it is ever changed.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeAlias, TypeVar

@@ -6,8 +6,6 @@ For ρ = 1 the step minimises ‖e − Ĵ dq‖² + λ‖dq‖². The paper has 
 newest measured error is used. Along a singular value σ of Ĵ the loop gain a period is ρσ²/(λ + σ²).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, final
 

@@ -10,8 +10,6 @@ with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 (and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, final
 

@@ -1,7 +1,5 @@
 """The control law of the proposed method: a controller matrix that learns from its own predicted errors (eqs. 7–27)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple, final

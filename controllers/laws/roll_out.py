@@ -10,8 +10,6 @@ own step only. Departures from the paper: ε, the joint-speed limit inside the p
 paper writes a negative α into an update with the opposite sign.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Settings of the offline training: region, sizes of the networks, samples and the grids of the held-out choice."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, TypeAlias
 
 from annotated_types import Ge, Len, Lt

@@ -1,7 +1,5 @@
 """Trained networks and the file that holds them: an .npz without pickles, written at once or not at all."""
 
-from __future__ import annotations
-
 import struct
 import tokenize
 import zipfile

@@ -18,8 +18,6 @@ Widths and regularisation are the best of a small grid on held-out samples. Noth
 configuration's own seed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator

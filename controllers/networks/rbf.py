@@ -12,8 +12,6 @@ Eq. 16 does not square the norm; that is the default here ("exponential") and th
 the paper: exponents are cut at 60, so that a unit far away is 1e-26 instead of an underflow.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, final, get_args

@@ -9,8 +9,6 @@ there is none, the regression B on J_n (`stages.regression`), and from the pair 
 to the feature's motion Δy.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple, final
 

@@ -5,8 +5,6 @@
 within the limits of the joints' speeds (`limit`); Ĵ⁺ is the damped pseudo-inverse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from typing import final

@@ -5,8 +5,6 @@ first shrinks the wanted step until no joint exceeds its limit. The joints that 
 feature's step, until one after the other has none left, always along the wanted direction of the feature.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

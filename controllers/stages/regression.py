@@ -30,8 +30,6 @@ prior.
 All functions are pure; the axis of the filters follows the leading axes of runs side by side.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple, TypeAlias, final
 
 import numpy as np

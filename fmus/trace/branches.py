@@ -5,8 +5,6 @@ be left in its middle: it goes on, and returns the code of a fault beside its re
 recorded on their own, such as the ways of a branch, collect their faults in a frame each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Linear algebra works matrix by matrix; a matrix that LAPACK would refuse is noted as a fault.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple

@@ -5,8 +5,6 @@ arrays, the decisions of `plant.contract.lanes` and memos do not: while code is 
 all modules of this package but its FMUs.
 """
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping

@@ -233,7 +233,7 @@ def _paired_values(
     first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
     for name, series in zip(pair, (first, second), strict=True):
         if series.index.has_duplicates:
-            raise ValueError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
+            raise ConfigurationError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
     common = first.index.intersection(second.index, sort=False)
     if len(common) == 0:
         raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")

@@ -1,11 +1,10 @@
 """Export of the steps of runs: as CSV, and as MCAP for Foxglove and other readers."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
 from collections.abc import Hashable, Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -14,9 +13,10 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
+from servobench.harness.batch.tables import write_csv
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason
+from servobench.plant.contract.files import reason, write_atomically
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
@@ -63,15 +63,15 @@ def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[
     """Write the steps of `runs`, and for CSV their table, into a new folder and return the files."""
     files = [out / "runs.csv"] if kind == CSV else []
     if kind == CSV:
-        runs.to_csv(files[0], index=False)
+        write_csv(runs, files[0])
     for row in runs.to_dict("records"):
         if row["periods"] > 0:
             steps = results.load_steps(folder, [row["run_id"]])
             files.append(out / f"{row['run_id']}.{kind}")
             if kind == CSV:
-                steps.to_csv(files[-1], index=False)
+                write_csv(steps, files[-1])
             else:
-                write_mcap(files[-1], steps, row)
+                write_atomically(files[-1], partial(write_mcap, steps=steps, run=row))
     return files
 
 

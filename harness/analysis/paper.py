@@ -1,7 +1,5 @@
 """A results folder in LaTeX: its tables with booktabs, and a paragraph *Methods* with its BibTeX entry."""
 
-from __future__ import annotations
-
 import json
 import re
 import textwrap

@@ -157,7 +157,8 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
 
 
 def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
-    pairs = list(combinations(dict.fromkeys(runs["controller"]), 2))
+    seeds = {name: set(own["seed"]) for name, own in runs.groupby("controller", sort=False)}
+    pairs = [pair for pair in combinations(seeds, 2) if seeds[pair[0]] & seeds[pair[1]]]  # a batch may be unfinished
     if not pairs and metric is None:
         return []
     if not pairs:

@@ -6,8 +6,6 @@ however many tasks it was run on, as runs of one seed share a robot. Controllers
 are not ranked.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The public interface: run and compare controllers, by name or as objects, and read results; see `servobench`."""
 
-from __future__ import annotations
-
 import operator
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence

@@ -6,8 +6,6 @@ out the runs without a part, so that its tables are those of an undisturbed one,
 when they are needed, so that the memory of this process does not grow with their number.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -138,8 +136,8 @@ def carry_out_parts(parts: Mapping[str, Campaign], folder: Path, how: Execution)
     Raises:
         ConfigurationError: as `carry_out`.
     """
-    for name, campaign in parts.items():  # one that was not begun cannot be resumed
-        carry_out(campaign, folder / name, replace(how, resume=how.resume and (folder / name).exists()))
+    for name, campaign in parts.items():
+        carry_out(campaign, folder / name, how)
     return {name: results.load_runs(folder / name) for name in parts}
 
 
@@ -158,6 +156,8 @@ def _carry_out_at(
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
         resumed = how.resume and not is_unused(folder)  # under the lock: another process may have begun meanwhile
+        if how.resume and not resumed:
+            how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
             prepare_folder(folder, manifest, how.observer)
         else:

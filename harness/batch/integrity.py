@@ -1,14 +1,12 @@
 """The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from servobench.harness.batch import results, tables
-from servobench.harness.batch.lock import PARTS
+from servobench.harness.batch.lock import PARTS, refuse_links
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.batch.tables import DamagedFile, lacking, sums_of, writing
 from servobench.harness.run.result import log_entry
@@ -17,6 +15,9 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"
+REMADE: Final = (
+    "servobench report makes the page anew; the rest comes with the runs, from the same command in a new folder"
+)
 LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of failures is made
 
 
@@ -44,21 +45,25 @@ class Examination:
         files: number of examined files.
         runs: number of intact runs.
         wanted: number of runs of the batch; 0 where the folder does not tell.
+        left_out: files without a checksum, and results folders within the folder, which are examined one by one.
     """
 
     findings: list[Finding]
     files: int
     runs: int
     wanted: int
+    left_out: list[str]
 
 
 def examine(folder: Path) -> Examination:
-    """Read all files of a results folder that hold results and list the damaged ones.
+    """Read all files of a results folder and list the damaged ones.
 
     Raises:
-        ConfigurationError: there is no such folder, or nothing of a batch is in it.
+        ConfigurationError: there is no such folder, nothing of a batch or a link is in it, or its table has wrong
+            columns or identifiers.
     """
     check_resumable(folder)
+    refuse_links(folder)
     findings, manifest = [], dict[str, Any]()
     try:
         manifest = results.read_manifest(folder)
@@ -83,7 +88,13 @@ def examine(folder: Path) -> Examination:
     findings += [Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays]
     if RUNS in names and not faults.keys() & {RUNS, STEPS}:
         count = max(count, tables.row_count(folder, RUNS))
-    return Examination(findings, len(names) + 1, count, manifest.get("run_count", 0))
+    if count and not findings:
+        results.load_runs(folder)
+    for name in (beside := results.accompanying(folder)):
+        if wrong := results.file_fault(folder, name):
+            findings.append(Finding(name, wrong, REMADE))
+    left_out = [name for name in results.unlisted(folder) if name not in names and name != MANIFEST]
+    return Examination(findings, len(names) + 1 + len(beside), count, manifest.get("run_count", 0), left_out)
 
 
 def check_resumable(folder: Path) -> None:
@@ -123,7 +134,7 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
                 kept[name] = frozenset([digest(folder / name)])
             if wrong and name in (RUNS, STEPS):
                 yield f"{folder / name} {wrong}: runs that are in no part are carried out again"
-        keep_sums(folder, kept)
+        keep_sums(folder, kept | results.accompanying(folder))
         for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # remains of a process that was killed
             if PARTIAL.fullmatch(path.name):
                 path.unlink()
@@ -209,10 +220,10 @@ def _fault(folder: Path, name: str) -> str | None:
     wrong = results.file_fault(folder, name)
     if wrong is None and sums_of(folder) is None and name.endswith(".parquet"):
         try:
-            columns = tables.common_schema(folder, [name]).names
-            for _ in tables.row_groups(folder, name, columns):
+            schema = tables.common_schema(folder, [name])
+            for _ in tables.row_groups(folder, name, schema.names):
                 pass
-            wrong = lacking("runs" if name.endswith(RUNS) else "steps", columns) or None
+            wrong = lacking("runs" if name.endswith(RUNS) else "steps", schema) or None
         except DamagedFile as error:
             return error.fault
     return wrong

@@ -93,9 +93,10 @@ def locked(folder: Path) -> Iterator[Lock]:
         folder: made if needed.
 
     Raises:
-        ConfigurationError: another process writes the folder, or it cannot be made.
+        ConfigurationError: another process writes the folder, it cannot be made, or a link is in it.
     """
     path = folder / LOCK
+    refuse_links(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, stale = _acquire(path)
@@ -146,7 +147,7 @@ def _open(path: Path) -> tuple[int, bool]:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
     except FileExistsError:
-        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666), False
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), False
 
 
 def _remove_stale(path: Path, holder: Holder | None) -> None:
@@ -211,10 +212,29 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
         raise ConfigurationError(f"results folder {folder} exists already; name another one with --out{resume}")
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder that holds anything but files and folders: by a link, files elsewhere would be read or written.
+
+    Raises:
+        ConfigurationError: names the link, pipe, socket or device.
+    """
+    waiting = [os.fspath(folder)]
+    while waiting:
+        with contextlib.suppress(OSError), os.scandir(waiting.pop()) as inside:
+            for entry in inside:
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+                elif not entry.is_file(follow_symlinks=False):
+                    kind = "a link" if entry.is_symlink() else "no file"
+                    raise ConfigurationError(
+                        f"{entry.path} is {kind}, and a results folder holds files only; put a copy in its place"
+                    )
+
+
 def is_unused(folder: Path) -> bool:
-    """Return whether a folder is empty, or holds only the remains of a batch that ended before its first run."""
+    """Return whether a folder is missing, empty, or holds only what a batch leaves that ends before its first run."""
     if not folder.is_dir():
-        return False
+        return not folder.exists()
     try:
         inside = (
             path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name)

@@ -1,7 +1,6 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
-from __future__ import annotations
-
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -9,6 +8,7 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.harness.batch import results
+from servobench.harness.config.registry import MAPPED
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, varied_in_row
@@ -19,6 +19,7 @@ from servobench.plant.robot.mismatch import Mismatch
 
 READERS: Final[Mapping[str, Callable[..., Any]]] = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
+CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plants, controllers and set-ups
 TASK: Final = "circle"  # likewise, without effect
 
 
@@ -38,18 +39,28 @@ def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
     return {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
 
 
-def logged_in_folder(folder: Path, run_id: str | None, controller: str | None) -> tuple[ResolvedRun, pd.DataFrame]:
+def logged_in_folder(
+    folder: Path, run_id: str | None, controller: str | None, sensing: str = ""
+) -> tuple[ResolvedRun, pd.DataFrame]:
     """Return a run of a results folder and its steps.
 
     Args:
         folder: of results, with steps.
         run_id: of the run; None for the only one.
         controller: that is to see it, with its default settings; None for the one of the run, with those of the run.
+        sensing: set-up that the user names, which may be a file of code.
 
     Raises:
-        ConfigurationError: no such run, one without steps, or one that cannot be made ready here.
+        ConfigurationError: no such run, one without steps, one whose row names code that the user did not name, or one
+            that cannot be made ready here.
     """
     row = find_run(folder, run_id)
+    for word in ("plant", "sensing", *([] if controller else ["controller"])):
+        if CODE.search(name := str(row.get(word, ""))) and name != sensing:
+            raise ConfigurationError(
+                f"{folder} names code that would be run, {word} {name}; "
+                + ("nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it")
+            )
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")

@@ -1,7 +1,5 @@
 """The manifest of a results folder: resolved configuration, versions, seeds, git commit, checksums of named files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform

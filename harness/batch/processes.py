@@ -4,8 +4,6 @@ The one module that imports psutil. On Linux a process can adopt the orphans amo
 was started in a session of its own, with its parent gone, also stays below the process that answers for it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math

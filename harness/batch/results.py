@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -23,10 +24,10 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from servobench.harness.batch import tables
-from servobench.harness.batch.lock import PARTS, check_empty
+from servobench.harness.batch.lock import LOCK, PARTS, check_empty, refuse_links
 from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
 from servobench.harness.run.result import RunResult, log_entry
-from servobench.plant.contract.checksums import SUMS, digest, fault, keep_sums, write_vouched
+from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, write_atomically
 
@@ -160,6 +161,7 @@ def collect(folder: Path) -> int:
         ConfigurationError: there are no parts and no tables, or a file is damaged.
         UnwritableFolder: the folder takes no more files.
     """
+    load_runs(folder)  # refuses what is not of runs
     return put_together(folder, read_manifest(folder))
 
 
@@ -182,11 +184,42 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
             files[kind] = partial(tables.join, folder, names, campaign)
     with writing(folder):
         write_vouched(folder, files)
+        vouch(folder, [folder / name for name in unlisted(folder) if not name.endswith("/")])
         count = tables.row_count(folder, RUNS)
         if count >= wanted:
-            keep_sums(folder, {name: frozenset([digest(folder / name)]) for name in [MANIFEST, *files]})
+            kept = {name: frozenset([digest(folder / name)]) for name in [MANIFEST, *files]}
+            keep_sums(folder, kept | accompanying(folder))
             shutil.rmtree(folder / PARTS)
     return count
+
+
+def vouch(folder: Path, paths: Sequence[Path]) -> None:
+    """Write down the checksums of files that accompany the tables, such as figures, where the folder has checksums."""
+    sums = sums_of(folder)
+    if sums is not None:
+        digests = {f"{path.relative_to(folder)}": digest(path) for path in paths if path.is_relative_to(folder)}
+        with writing(folder):
+            append_sums(folder, {name: each for name, each in digests.items() if each not in sums.get(name, ())})
+
+
+def accompanying(folder: Path) -> dict[str, frozenset[str]]:
+    """Return the checksums of the files that accompany the tables: networks, pictures, figures, the report."""
+    tabled = (MANIFEST, RUNS, STEPS, FAILURES)
+    sums = sums_of(folder) or {}
+    return {name: each for name, each in sums.items() if name not in tabled and not name.startswith(f"{PARTS}/")}
+
+
+def unlisted(folder: Path) -> list[str]:
+    """Return the names of the files of a folder that have no checksum, and of results folders within it, with a `/`."""
+    names, sums = list[str](), sums_of(folder) or {}
+    for place, inside, files in os.walk(folder):
+        for each in [each for each in inside if (Path(place) / each / MANIFEST).exists()]:
+            names.append(f"{(Path(place) / each).relative_to(folder)}/")
+            inside.remove(each)
+        if Path(place) == folder / PARTS:
+            continue
+        names += [f"{(Path(place) / each).relative_to(folder)}" for each in files if not PARTIAL.fullmatch(each)]
+    return sorted(name for name in names if name not in sums and name not in (SUMS, LOCK))
 
 
 def load_runs(folder: Path) -> pd.DataFrame:
@@ -199,7 +232,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
     check_folder(folder)
     names = _intact(folder, RUNS)
     runs = tables.read_tables(folder, names)
-    refuse_lacking(folder / names[0], "runs", runs.columns)
+    refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
     refuse_nameless(folder / names[0], runs)
     return runs
 
@@ -239,7 +272,7 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     check_folder(folder)
     names = _intact(folder, STEPS)
     for name in names:
-        refuse_lacking(folder / name, "steps", tables.common_schema(folder, [name]).names)
+        refuse_lacking(folder / name, "steps", tables.common_schema(folder, [name]))
     steps = tables.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
@@ -266,8 +299,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a results folder.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema, or the manifest is damaged.
+        ConfigurationError: not a results folder, one of another schema or with a link in it, or a damaged manifest.
     """
+    if os.path.lexists(folder / MANIFEST):
+        refuse_links(folder)
     if is_expected(folder, MANIFEST):
         _refuse_damaged(folder, [MANIFEST])
     try:

@@ -10,8 +10,6 @@ of another; when a task is over and left processes or much memory behind; and wh
 also because this process was killed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import gc

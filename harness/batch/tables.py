@@ -1,9 +1,8 @@
 """Tables in Parquet files with a checksum a page: written, read, and put together while few rows are in memory."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,10 +13,16 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
+from servobench.harness.run.metrics import METRICS
+from servobench.harness.run.request import SHORT_NAMES
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_atomically
 
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
+MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
+MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table, whatever its size, and by the size of its file
+FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
@@ -67,14 +72,26 @@ def sums_of(folder: Path) -> Sums | None:
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """Return rows as a table with the columns of all; NaN is null, and a column of NaN alone is one of numbers."""
+    """Return rows as a table with the columns of all; NaN is null, and an empty column of numbers is one of numbers."""
 
     def column(name: str) -> pa.Array:
         values = [row.get(name) for row in rows]
         made = pa.array(values, from_pandas=True)
-        return made.cast(pa.float64()) if pa.types.is_null(made.type) and float in map(type, values) else made
+        numbers = name in NUMBERS or float in map(type, values)
+        return made.cast(pa.float64()) if pa.types.is_null(made.type) and numbers else made
 
     return pa.table({name: column(name) for name in dict.fromkeys(name for row in rows for name in row)})
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV, atomically; a text that a spreadsheet would run as a formula begins with an apostrophe."""
+
+    def quoted(cell: Any) -> Any:  # noqa: ANN401 - a cell of any kind
+        return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell
+
+    texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
+    safe = table.assign(**texts).rename(columns=quoted)
+    write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
 
 def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
@@ -173,9 +190,16 @@ def opened(folder: Path, name: str) -> Iterator[pq.ParquetFile]:
     """Yield a table that is open for reading.
 
     Raises:
-        DamagedFile: it cannot be read.
+        DamagedFile: it cannot be read, unpacks to too much, or has columns of wrong names.
     """
     with reading(folder, name), pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
+        names, cells = file.schema_arrow.names, file.metadata.num_rows * file.metadata.num_columns
+        if len(names) > MAX_COLUMNS:
+            raise DamagedFile(folder, name, f"has {len(names)} columns; a table has at most {MAX_COLUMNS}")
+        if cells > max(MAX_CELLS, MAX_CELLS_A_BYTE * (folder / name).stat().st_size):
+            raise DamagedFile(folder, name, f"is a bomb: it unpacks to {cells:.2g} cells")
+        if len(set(names)) < len(names) or not all(each.isprintable() and len(each) <= MAX_NAME for each in names):
+            raise DamagedFile(folder, name, "has two columns of one name, or a name that cannot be printed")
         yield file
 
 
@@ -199,27 +223,45 @@ NEEDED: Final = {
     "runs": ("run_id", "plant", "controller", "task", "mismatch", "seed", "status"),
     "steps": ("run_id", "time_s", "error_norm"),
 }
-RUN_ID: Final = re.compile(r"[A-Za-z0-9=+_-][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
+TEXTS: Final = frozenset(
+    ("run_id", "plant", "controller", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit",
+     "status", "outcome", "reason", "mismatch_values", "part")
+)  # fmt: skip
+SHORT: Final = (short.column for short in SHORT_NAMES.values())
+NUMBERS: Final = frozenset({"seed", "periods", "settling_band", *METRICS, *SHORT})
+RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
 
-def lacking(kind: str, columns: Collection[str]) -> str:
-    """Return which columns a table of runs or steps lacks that it needs, as a predicate; empty where it has all."""
-    missing = [name for name in NEEDED[kind] if name not in columns]
-    return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}" if missing else ""
+def lacking(kind: str, schema: pa.Schema) -> str:
+    """Return which columns a table of runs or steps lacks, or has of another type, as a predicate; empty if none."""
+    missing = [name for name in NEEDED[kind] if name not in schema.names]
+    if missing:
+        return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}"
+    return next(filter(None, (_mistyped(kind, each.name, each.type) for each in schema)), "")
 
 
-def refuse_lacking(path: Path, kind: str, columns: Collection[str]) -> None:
+def _mistyped(kind: str, name: str, given: pa.DataType) -> str:
+    """Return that a column is of another type than it should be, as a predicate; empty if it is not."""
+    is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
+    is_number = pa.types.is_integer(given) or pa.types.is_floating(given) or pa.types.is_boolean(given)
+    text, number = name in TEXTS, name in NUMBERS or (kind == "steps" and name != "run_id")
+    if pa.types.is_null(given) or (is_text and not number) or (is_number and not text):
+        return ""
+    return f"has {given} in the column {name}, where {'texts' if text else 'numbers'} belong"
+
+
+def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:
     """Refuse a table that is none of runs or steps.
 
     Raises:
-        ConfigurationError: names the table and the columns that it lacks.
+        ConfigurationError: names the table and its wrong columns.
     """
-    if lack := lacking(kind, columns):
+    if lack := lacking(kind, schema):
         raise ConfigurationError(f"{path} is no table of {kind}: it {lack}")
 
 
 def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
-    """Refuse a table of runs in which a run is not identified, or its identifier is unfit for the name of a file.
+    """Refuse a table of runs in which a run is not identified, or not fit for the name of a file, or a number is -inf.
 
     Raises:
         ConfigurationError: names the table, the column and the row.
@@ -227,6 +269,9 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     for name in NEEDED["runs"]:
         if (empty := runs[name].isna()).any():
             raise ConfigurationError(f"{path} is no table of runs: row {int(empty.to_numpy().argmax())} has no {name}")
+    for name in NUMBERS.intersection(runs.columns):
+        if (runs[name] == -math.inf).any():
+            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number -inf")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(

@@ -1,7 +1,5 @@
 """The contract of a controller, checked on made-up arms: `check_controller`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The contract of a plant, checked on a mismatched arm: `check_plant`."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Final

@@ -1,7 +1,5 @@
 """Findings of checks: each ok, failed or a note."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,6 +16,7 @@ from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_atomically
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
@@ -51,7 +53,8 @@ def new(
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
             text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
-            path.write_text(text.replace("{{module}}", module).replace("{{Class}}", class_name), encoding="utf-8")
+            text = text.replace("{{module}}", module).replace("{{Class}}", class_name)
+            write_atomically(path, partial(Path.write_text, data=text, encoding="utf-8"))
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]
@@ -117,6 +120,7 @@ def shadow(
     Nothing is simulated: its commands do not change the log.
     """
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+    from servobench.harness.batch.tables import write_csv
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
@@ -125,7 +129,7 @@ def shadow(
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     chosen = None if controller is None else choose_controller(controller)
     if log.is_dir():
-        resolved, table = logged_in_folder(log, run, chosen)
+        resolved, table = logged_in_folder(log, run, chosen, sensing)
     elif chosen is None:
         raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
     else:
@@ -134,7 +138,7 @@ def shadow(
         seen = see(resolved, table)
     if out is not None:
         with writing(out):
-            seen.to_csv(out, index=False)
+            write_csv(seen, out)
         say(f"table in {out}")
     elif not has_commands(seen):
         raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, say
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import reason
 
 if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
@@ -43,8 +45,11 @@ class Export:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
         try:
             yield parse_platforms(self.platforms)
-        except (ValueError, OSError) as error:
+        except ValueError as error:
             raise ConfigurationError(str(error)) from error
+        except OSError as error:
+            place = error.filename or tempfile.gettempdir()
+            raise ConfigurationError(f"{place} cannot be written: {reason(error)}") from error
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
@@ -130,7 +135,7 @@ def validate(file: FileArgument) -> None:
     for problem in found.problems:
         say(f"problem: {problem}")
     if found.deviation is None:
-        say("no reference run inside")
+        say("no reference run inside" + ("" if found.problems else "; it was loaded and made ready for a run"))
     else:
         say(f"reference run: largest difference {found.deviation:.2g}")
     if found.problems:

@@ -49,6 +49,7 @@ def analyse(
     Also sensitivity, and stability over gain and latency.
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
+    from servobench.harness.batch.tables import write_csv
     from servobench.harness.pictures.loops import write_pictures
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
@@ -68,9 +69,9 @@ def analyse(
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        table.to_csv(out / TABLE, index=False)
-    text = printed(table)
-    page = write_pictures(out, loops, text, LEGEND)[0]
+        write_csv(table, out / TABLE)
+        text = printed(table)
+        page = write_pictures(out, loops, text, LEGEND)[0]
     title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
     print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
     say(f"table in {out / TABLE}, pictures in {page}")

@@ -1,12 +1,11 @@
 """The command `servobench`."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import faulthandler
 import io
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Final, NoReturn
@@ -114,6 +113,8 @@ def _no_type(ctx: object) -> None:
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
     _say_where_a_signal_strikes()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as below `&` of a script and in some CI
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(os, "fork"):
         _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")
     try:

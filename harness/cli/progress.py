@@ -1,7 +1,5 @@
 """Progress of long commands: bars in a terminal, elsewhere a line now and then on standard error."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

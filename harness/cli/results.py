@@ -123,6 +123,7 @@ def figures(
     if not files:
         kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
         raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+    results.vouch(folder, files)
     say("\n".join(map(str, files)))
 
 
@@ -136,6 +137,7 @@ def make_report(folder: Path, out: Path | None = None) -> None:
     began = time.monotonic()
     with console.status("making the report"):
         path = write_report(folder, out)
+        results.vouch(folder, [path])
     seconds = time.monotonic() - began
     took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
     say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")
@@ -169,6 +171,9 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
     if line := missing_line(found.runs, found.wanted):
         say(line)
+    if found.left_out:
+        more = f" and {len(found.left_out) - MAX_FAULTS} more" if len(found.left_out) > MAX_FAULTS else ""
+        say(f"not checked, as SHA256SUMS does not list it: {', '.join(found.left_out[:MAX_FAULTS])}{more}")
     if found.findings:
         sys.exit(FAILED)
     say(f"{found.files} files are as they were written, {found.runs} runs")

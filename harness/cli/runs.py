@@ -169,6 +169,7 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
         point_latest(folder)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
+        results.vouch(folder, figures)
     say(f"tables and {len(figures)} figures in {folder}")
     if with_report:
         try:

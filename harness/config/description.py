@@ -1,7 +1,5 @@
 """Descriptions of settings: unit, meaning, allowed values and value in TOML; and a commented file of all of them."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -7,8 +7,6 @@ worlds get a `PlantSetup` in place of the knowledge; a world is put on a bench. 
 line with their place, and answers of a world are checked.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import re

@@ -10,8 +10,6 @@ Without a mapping, variables are looked for under the names that exported contro
 are written, a step of one period is taken, and the outputs are read.
 """
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Mapping
 from pathlib import Path

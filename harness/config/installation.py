@@ -1,7 +1,5 @@
 """The installation: version and commit of servobench, and the extras that bring missing packages."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version

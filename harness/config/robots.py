@@ -1,7 +1,5 @@
 """Robots and sensing set-ups by the words that users give: names of this package, or files of the user."""
 
-from __future__ import annotations
-
 import re
 from functools import lru_cache
 from pathlib import Path

@@ -10,8 +10,6 @@ of which a nominal model is known, where an estimator learns the difference from
 has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """A run as an environment of Gymnasium: the policy is the controller, everything else is the harness's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final, final

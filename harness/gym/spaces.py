@@ -1,7 +1,5 @@
 """The observation and action spaces of a policy and its reward, over any leading axes."""
 
-from __future__ import annotations
-
 from typing import Final, TypeAlias, final
 
 import numpy as np

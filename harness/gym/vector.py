@@ -1,7 +1,6 @@
 """Runs side by side as a vector environment of Gymnasium: one plant with a lane for each."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from typing import Any, cast, final
 
 import gymnasium
@@ -15,6 +14,7 @@ from servobench.harness.gym.spaces import Floats32, Spaces
 from servobench.harness.run.experiment import Experiment, build_together
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
+from servobench.harness.run.request import read_seed
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -67,26 +67,35 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self._many: Experiment | None = None
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats32, dict[str, Any]]:
         """Begin a run in every lane.
 
         Args:
-            seed: of the first lane, from which the others count on; None draws one for each.
+            seed: of the first lane, from which the others count on, or one of each lane; None draws one.
             options: there are none.
 
         Returns:
             The observations of the policies, (num_envs, k), and `seed`, (num_envs,).
 
         Raises:
-            ConfigurationError: options are given, or a seed above 2⁶³ − num_envs.
+            ConfigurationError: options are given, a seed above 2⁶³ − num_envs, or a list of seeds of another length.
         """
         check_options(options)
-        super().reset(seed=seed)
         count = self.num_envs
-        if seed is not None and seed > 2**63 - count:
-            raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {seed}")
-        seeds = self.np_random.integers(SEEDS, size=count) if seed is None else seed + np.arange(count)
+        listed: list[int | None] | None = None
+        if isinstance(seed, list | tuple | np.ndarray):
+            listed = [None if each is None else read_seed(each) for each in seed]
+        if listed is not None and len(listed) != count:
+            raise ConfigurationError(f"seed must be a number or a list of {count}, got {len(listed)} seeds")
+        first = cast("int | None", seed if listed is None else listed[0])
+        super().reset(seed=first)
+        if first is not None and first > 2**63 - count:
+            raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
+        seeds = self.np_random.integers(SEEDS, size=count) if first is None or listed else first + np.arange(count)
+        if listed is not None:
+            pairs = zip(listed, seeds.tolist(), strict=True)
+            seeds = np.array([drawn if each is None else each for each, drawn in pairs])
         self.close_extras()
         self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
         bench = self._bench = cast(Bench, many.plant)

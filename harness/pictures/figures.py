@@ -1,7 +1,5 @@
 """All figures of a results folder, from its tables alone."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping

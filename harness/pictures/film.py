@@ -5,8 +5,6 @@ ffmpeg of every requested film, which the optional extra `animation` installs. A
 until then it has a hidden name, and an interruption removes it and ends ffmpeg.
 """
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import tempfile

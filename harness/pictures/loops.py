@@ -1,7 +1,5 @@
 """Pictures of analysed loops: Bode, Nyquist, sensitivity, step, limits of gain over latency; and a page of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path

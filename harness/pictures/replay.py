@@ -4,8 +4,6 @@ The true robot is sampled again from the run's mismatch and seed and compared wi
 simulated: each frame has the logged joint positions, and the ball is detected in an image without noise.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

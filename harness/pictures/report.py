@@ -5,8 +5,6 @@ no network. The template `report.html.j2` writes tables and figures; paths in sp
 numbers that `space.js` and `report.js` draw. `notebooks/analysis.ipynb` shows the same in a notebook.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

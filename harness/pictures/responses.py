@@ -9,8 +9,6 @@
 | 8 | the arm at eight places on the circle | `servobench.harness.pictures.film` |
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace

@@ -5,8 +5,6 @@ Without this a step that returns an array ends in an attribute error of the loop
 controllers and plants that this package composes itself are not checked, so that they cost nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from numbers import Real
 from typing import Any, Final, final

@@ -1,7 +1,5 @@
 """One run carried out: a row of results and a table of steps."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Mapping, Sequence

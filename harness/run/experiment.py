@@ -5,8 +5,6 @@ A target that a task gives as a feature is compared with the reach of the nomina
 run is refused only where no true robot of that mismatch could do it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 The step of a controller is recorded, and a run of it is kept inside the FMU for comparison.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice

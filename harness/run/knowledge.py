@@ -1,7 +1,5 @@
 """The knowledge of a controller before a run: the nominal arm, and networks trained on it and kept in a cache."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable
 from dataclasses import replace

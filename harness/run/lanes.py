@@ -6,8 +6,6 @@ controller concerns some lanes only, but does not say which: the step is pure, s
 until the failing run is found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from typing import Any, final
 

@@ -11,8 +11,6 @@ Linear algebra runs on one thread, for the same bits on any number of processors
 an error (`careful`).
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager

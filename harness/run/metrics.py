@@ -5,8 +5,6 @@ show it, and the function that computes it. docs/results.md, the tables of a com
 report are made from the declarations. All errors are those of the true feature.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -14,8 +14,6 @@ The first word that applies counts, from the good ones over `target_unreachable`
 reach drives joints to their stops, not the other way round. The band of a curve is two settling bands wide.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Final

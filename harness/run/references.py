@@ -11,8 +11,6 @@ For a user's camera the curve is about the middle of the workspace as that camer
 hand about the target at home; ρ is at most 1, and smaller by as much as less of the workspace is in the image.
 """
 
-from __future__ import annotations
-
 import csv
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

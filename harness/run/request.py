@@ -1,7 +1,5 @@
 """The request for a run: one cell of a comparison, and the settings that are common to all cells."""
 
-from __future__ import annotations
-
 import json
 import math
 import operator

@@ -1,7 +1,5 @@
 """A request with all its settings as typed values: names looked up and texts read once a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any

@@ -4,8 +4,6 @@ A task is a frozen dataclass below `Task` with a default for every field. The de
 `scaled` moves them to the same places in another arm's workspace.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace

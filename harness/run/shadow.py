@@ -4,8 +4,6 @@ The loop is open. Joint positions and features are those of the log, independent
 predicts a run under these commands; only the answers to the same observations are compared.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, final
 

@@ -21,8 +21,6 @@ differently before the first camera:
 The start is found on the nominal arm. Where an arm cannot reach it with the target in view, D is made smaller.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 

@@ -9,8 +9,6 @@ A user brings a task as a file with a dataclass below `Task`, or publishes it, o
 group `servobench.tasks`.
 """
 
-from __future__ import annotations
-
 from dataclasses import is_dataclass, replace
 from typing import Any, ClassVar, Final, Literal, Self
 

@@ -15,8 +15,6 @@ lost runs, or another one is the first beyond its interval. III: the best is bel
 files of the folder `challenges` are known by their names; a user adds a challenge by the path of a file.
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace

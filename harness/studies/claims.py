@@ -17,8 +17,6 @@ A rule that holds in none of its cases is *not reproduced*, one that holds in so
 `comparison`; in claim 4 a run that never settles counts as its whole duration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite

@@ -1,7 +1,5 @@
 """The reproduction of the paper: carry out its runs, answer its claims, write tables and figures."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

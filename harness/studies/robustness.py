@@ -4,8 +4,6 @@ Every method gets the same robots, starts and targets at every place of the map.
 take longer, so that there is time to recover. The usual map has the axes `LINES`; a user names others.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence

@@ -8,8 +8,6 @@ A run is lost if it does not settle, on a curve if it is not followed. A challen
 `MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -25,6 +23,7 @@ from servobench.harness.analysis.statistics import median_with_interval, success
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
+from servobench.harness.batch.tables import write_csv
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import (
     TEXT,
@@ -77,7 +76,7 @@ def carry_out_suite(
     parts = {name: Campaign(own, Settings(sections)) for name, own in runs.items()}
     tables = carry_out_parts(parts, out, how)
     judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
-    judged.to_csv(out / RUNS, index=False)
+    write_csv(judged, out / RUNS)
     for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
         pd.json_normalize(as_plain(rows)).to_csv(out / name, index=False)
     for plant, own in bounded(judged).groupby("plant", sort=False):

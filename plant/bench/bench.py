@@ -8,8 +8,6 @@ sub-steps (`plant.contract.timing`). Other disturbances of a frame are in `plant
 by side share one bench: their arrays have a leading axis, and each run has random streams of its own.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections import deque

@@ -5,8 +5,6 @@ of its own below `Plant`; a settings class; and a `PlantEntry` that is named in 
 published under the entry-point group `servobench.plants`.
 """
 
-from __future__ import annotations
-
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping

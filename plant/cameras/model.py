@@ -10,8 +10,6 @@ with points t of the target in the flange frame or in the base frame, and the jo
 ratios g_i.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Literal, Self, TypeAlias, final

@@ -15,8 +15,6 @@ Beyond the r at which the radial polynomial turns back, a point would appear a s
 functions take leading axes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

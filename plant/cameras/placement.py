@@ -17,8 +17,6 @@ A camera of the user's is where its file says, and its deviations are drawn on t
 file does not place it, is on its optical axis with the arm at home, if it is on the hand.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from math import atan2, cos, radians, sin

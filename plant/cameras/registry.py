@@ -1,7 +1,5 @@
 """The sensing set-ups by name, and the words that name them with a mount: `pixel`, `stereo:hand`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self

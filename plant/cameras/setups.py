@@ -12,8 +12,6 @@ A further set-up is a `SensingSetup` in this file and its name in `plant.cameras
 names on the command line.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

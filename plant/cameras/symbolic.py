@@ -7,8 +7,6 @@ expression serves both a model with fixed numbers and a function (or generated C
 set-up whose function CasADi cannot evaluate has no symbolic twin.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self, TypeAlias
 

@@ -7,8 +7,6 @@ An entry appears whole or not at all, also if several processes make it at once.
 flipped bit or a file cut short never reaches a run. Entries that were not used for long are removed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Checks of arrays and numbers at the boundary of a function."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ its file has its name, so that a file without a line was never written here, and
 lines say was changed since. A line without a file says nothing: the process was killed in between.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

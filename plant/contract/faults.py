@@ -15,8 +15,6 @@
 A plant or controller of a third party derives its own from `RunFault`.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 

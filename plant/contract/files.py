@@ -1,7 +1,5 @@
 """Atomic writing of files, and reading of TOML with errors of one line."""
 
-from __future__ import annotations
-
 import os
 import re
 import threading
@@ -26,6 +24,10 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         sync(partial)
         partial.replace(path)
         sync(path.parent)
+    except OSError as error:
+        if error.errno is not None:
+            error.filename = str(path)  # that of the user: a full disk names no file, other errors the partial one
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

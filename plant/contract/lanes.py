@@ -9,8 +9,6 @@ A lane has the same bits beside any neighbours, as long as no leading axis becom
 are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass

@@ -1,7 +1,5 @@
 """One seed a run; every part draws from a stream of its own, spawned by name."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from typing import TypeAlias

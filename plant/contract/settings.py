@@ -11,8 +11,6 @@ The string below a field says its meaning, unit and source; the documentation's 
 Rules across fields stand in `__post_init__` and raise `ValueError`. Validation is by pydantic.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import inspect

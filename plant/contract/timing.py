@@ -6,8 +6,6 @@ the physical world is the same at every control rate. With N = T/h, the command 
 sub-step j of period k, for a delay of d sub-steps.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final, Self

@@ -3,8 +3,6 @@
 A setting's own unit stands in brackets at the begin of the string below its field; a plain number is in this unit.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

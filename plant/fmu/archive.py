@@ -4,8 +4,6 @@ All processes share the folder and none writes into it; a second plant of the sa
 is judged by its table of contents before a byte is unpacked; Python's reader never unpacks more than that says.
 """
 
-from __future__ import annotations
-
 import errno
 import lzma
 import zipfile

@@ -4,8 +4,6 @@ A model-exchange FMU is integrated. The libraries are called by ctypes with argu
 then costs a third of a microsecond, whereas converting lists at every call costs several.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from abc import ABC, abstractmethod

@@ -4,8 +4,6 @@ Between two steps the FMU is in event mode, where commands of any kind may be se
 of time exactly, those of state where an indicator changes sign.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections.abc import Callable

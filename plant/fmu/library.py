@@ -1,7 +1,5 @@
 """The library of an FMU: loading it for this machine, the options of an instance, and its messages and status words."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import shutil

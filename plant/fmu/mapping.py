@@ -9,8 +9,6 @@
 The keys are the fields of `FmuMapping`, its sections the fields of their own classes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, field, fields, replace
 from pathlib import Path

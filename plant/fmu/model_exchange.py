@@ -6,8 +6,6 @@ The result answers like `plant.cameras.symbolic.symbolic_feature`, so that a mod
 own equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU with unknown equations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

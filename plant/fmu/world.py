@@ -5,8 +5,6 @@ FMU is stepped with its own period, which divides that of the world; commands ar
 are set before every run.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace

@@ -8,8 +8,6 @@ PyBullet's C library prints a banner, past `sys.stderr`, so the file descriptor 
 other output that is written to it in the meantime is passed on afterwards.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

@@ -6,8 +6,6 @@ pixels, so that neighbouring depths share their error: the noise is white noise 
 second moment and scaled back to unit variance.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

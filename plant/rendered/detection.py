@@ -10,8 +10,6 @@ hence so do the residuals: a fit of distances to the centre would be biased by n
 where that slope grows without bound, and pixels whose residual stands far off the others' take no part.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ focal length, principal point or distortion of such an ideal image, which is lar
 taking each pixel (u, v) from where the ray through it meets the ideal image.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from abc import ABC, abstractmethod

@@ -15,8 +15,6 @@ drives assume; I [kg m²] rotor inertia; B [Nm s/rad] viscous and F [Nm] Coulomb
 K_p = ω_v/4, ω_i = ω_v/10. Friction is taken implicitly, so that a joint sticks instead of chattering.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias

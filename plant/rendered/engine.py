@@ -3,8 +3,6 @@
 Joint angles here are the true ones, θ; the world frame W is the arm's base frame B.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

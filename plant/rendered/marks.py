@@ -15,8 +15,6 @@ direction of Σ w r / |r|⁴ over the rays r = (x/z, y/z, 1) through its pixels,
 that they cover, by the intrinsics that are planned.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import cv2

@@ -9,8 +9,6 @@ outside of it are left out, and no other pixel is filled. OpenGL samples pixels 
 `servobench.plant.robot.camera` elsewhere, so the camera's frustum is shifted by the difference.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

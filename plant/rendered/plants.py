@@ -1,7 +1,5 @@
 """The rendered plants, one for each physics engine."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

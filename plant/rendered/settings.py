@@ -1,7 +1,5 @@
 """Settings of plants that render images, the same for every engine; so are their defaults."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import field
 from typing import Annotated, Literal

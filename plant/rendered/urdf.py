@@ -8,8 +8,6 @@ Numbers are written with `repr`, so that none loses a digit. Meshes are Wavefron
 coarse that its front lies 6 % of the radius too deep, and its boxes draw six faces where one is enough.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 from xml.etree import ElementTree as ET

@@ -7,8 +7,6 @@ or an obstacle ends the run. Features are measured by `servobench.plant.rendered
 frames are those of `servobench.plant.bench.bench`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

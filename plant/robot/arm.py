@@ -12,8 +12,6 @@ translation (a_i, 0, d_i) and the roll α_i, and the calibration file that every
 The arms of many runs side by side are one arm, whose arrays have leading axes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

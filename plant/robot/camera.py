@@ -6,8 +6,6 @@ PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), n
 offset the error is 2.5 mm at 1.3 m.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Final, TypeAlias
 
 import numpy as np

@@ -7,8 +7,6 @@ the gears. It is as long as a UR5, and drawn again until it can work at the benc
 of the camera are those of the run's mismatch. Controllers know the joint limits and the number of features, no model.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -18,8 +18,6 @@ may have one entry more, which leads to the flange.
 Of a URDF, read by yourdfpy, the chain with the most rotating joints is taken, with its limits, masses and torques.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from math import isfinite, pi

@@ -8,8 +8,6 @@ camera the feature is the ball's centre in the camera frame (eqs. 1, 8 and 27 of
 The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Final, Self

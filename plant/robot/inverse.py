@@ -13,8 +13,6 @@ The pose of the flange, from one start, with the geometric Jacobian J (6×n) and
     Δq = Jᵀ (J Jᵀ + λ I)⁻¹ [ℓ⁻¹ (p* − p); log(R* Rᵀ)],        q ← clip(q + Δq, lower, upper)   if the error shrinks
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

@@ -8,8 +8,6 @@ the Franka Emika Panda robot with retrieval of feasible parameters using penalty
 Automation Letters 4 (2019). Radii of tubes are appearance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from math import pi

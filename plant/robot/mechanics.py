@@ -7,8 +7,6 @@ p is the place of the ball of a rigid tool at x, δ [m] and w [m/s] deflection a
 base frame. Gravity is left out: the ball rests at δ = 0. Play is exact where q is monotone.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Sources: Universal Robots, "DH parameters for calculations of kinematics and dyn
 and torques); inertia tensors by the cylinder approximation that the vendor's ROS description uses.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 

@@ -10,8 +10,6 @@ its Jacobian is well conditioned and the camera sees its ball. Links are taken a
 along its axis to the tube's side, along the tube, and to the next joint, as the rendered arm is drawn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -53,6 +54,15 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
     for single, double in zip(*tables, strict=True):
         assert len(single) >= 4
         pd.testing.assert_frame_equal(single, double, check_exact=True)
+
+
+def test_a_command_that_is_started_with_interrupts_ignored_can_be_interrupted(monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert servobench(monkeypatch, "--version") == 0
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_tests_that_are_started_with_interrupts_ignored_can_interrupt_nevertheless(tmp_path):

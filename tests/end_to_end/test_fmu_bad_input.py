@@ -72,6 +72,22 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     assert list(tmp_path.rglob("evil.txt")) == []
 
 
+def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "crane.fmu"
+    build_crane(path, 2)
+    monkeypatch.setattr("servobench.fmus.inspection.validate_by_fmpy", lambda _: [])  # the crane has no ModelStructure
+    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 0
+    assert "no reference run inside; it was loaded and made ready for a run\n" in capsys.readouterr().out
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist() if "." in name}
+    path.unlink()
+    write(path, {name: b"text" if name.startswith("binaries") else each for name, each in contents.items()})
+    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 1
+    output = capsys.readouterr().out
+    assert "problem: it cannot be made ready for a run: the library in crane.fmu cannot be loaded" in output
+    assert "it was loaded" not in output
+
+
 @pytest.mark.parametrize(
     ("version", "arguments", "more", "message"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tarfile
@@ -119,6 +120,13 @@ def test_only_the_tagged_commit_of_a_version_without_changes_is_a_release(tmp_pa
     assert moved.endswith("; git checkout v9.1.0, or --rehearse")
     git("tag", "--force", "v9.1.0")
     assert release.faults_of_commit(tmp_path, "9.1.0") == []
+
+
+def test_a_package_that_states_no_licence_is_told_unless_it_was_read(tmp_path):
+    stated = {"name": "numpy", "licenses": [{"expression": "BSD-3-Clause"}]}
+    bill = tmp_path / "bill.cdx.json"
+    bill.write_text(json.dumps({"components": [stated, {"name": "FMPy"}, {"name": "odd", "licenses": []}]}))
+    assert release.faults_of_licences(bill) == ["odd states no licence; read its files and add it to LICENCES"]
 
 
 def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):

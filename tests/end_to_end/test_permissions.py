@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -10,10 +11,45 @@ import sys
 
 import pytest
 
-from kit.command import PACKAGE
+from kit.command import PACKAGE, servobench
 from kit.folders import comparison
 from kit.robots import calibration_text
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
+
+FULL = (  # calls that write files, and the file that each names
+    ("init bench2.toml", "bench2.toml"),
+    ("new controller law", "law.py"),
+    ("export results --out csv", "csv/runs.csv"),
+    ("export results --out mcap --format mcap", "mcap/kinematic-"),
+    ("shadow steps.csv --controller constant --out seen.csv", "seen.csv"),
+)
+
+
+def two_steps() -> str:
+    """Return a log of two periods, as a user may have one."""
+    joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    columns = [f"{what}_{axis}_m" for what in ("feature", "reference") for axis in "xyz"]
+    columns += [f"joint_position_{name}_rad" for name in joints]
+    return ",".join(["time_s", *columns]) + "".join(f"\n{time}" + ",0.1" * len(columns) for time in (0, 0.05)) + "\n"
+
+
+@pytest.mark.parametrize(("call", "file"), FULL)
+def test_a_full_disk_is_one_line_with_the_file_and_leaves_none(call, file, tmp_path, monkeypatch, capsys):
+    def full(_path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.chdir(tmp_path)
+    comparison(tmp_path / "results", ("constant",), ("exp1",))
+    (tmp_path / "steps.csv").write_text(two_steps())
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr("servobench.plant.contract.files.sync", full)
+    assert servobench(monkeypatch, *call.split()) in (1, 2)
+    error = capsys.readouterr().err
+    assert file in error
+    assert "No space left on device" in error
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
 
 RUN = "run --plant kinematic --controller constant --set exp2.duration=0.5 --out new"
 LOCKED, HIDDEN = 0o500, 0  # modes of a folder that takes no file, and of what cannot be read
@@ -79,12 +115,7 @@ def told(tmp_path_factory):
     for name in ("bench.toml", "law.py", "arm.toml", "arm.fmu", "way.csv"):
         (folder / name).write_text("")
     (folder / "arm.yaml").write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
-    joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-    columns = [f"{what}_{axis}_m" for what in ("feature", "reference") for axis in "xyz"]
-    columns += [f"joint_position_{name}_rad" for name in joints]
-    (folder / "steps.csv").write_text(
-        ",".join(["time_s", *columns]) + "\n0" + ",0.1" * len(columns) + "\n0.05" + ",0.1" * len(columns) + "\n"
-    )
+    (folder / "steps.csv").write_text(two_steps())
     without = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.geteuid() == 0 else []
     made = subprocess.run(
         [*without, sys.executable, "-c", SCRIPT], cwd=folder, input=json.dumps(CASES), capture_output=True, text=True,

@@ -46,7 +46,7 @@ def run(result):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, result):
     made = tmp_path_factory.mktemp("record") / "out"
-    results.create_folder(made, {"configuration": {"bullet": {"width": 160, "height": 120}}})
+    results.create_folder(made, {"configuration": {"bullet": {"scenery": False}}})
     results.write_part(made, 0, [result])
     results.collect(made)
     return made
@@ -262,12 +262,12 @@ def test_runs_that_cannot_be_shown_are_refused(result):
         logged_run(row | {"mismatch_values": json.dumps(other)}, steps, {})
     with pytest.raises(ConfigurationError, match="'mild' is not known"):
         logged_run(row | {"mismatch": "mild"}, steps, {})
-    with pytest.raises(ConfigurationError, match="settings of the camera in the manifest: width must be"):
-        logged_run(row, steps, {"width": -1})
+    with pytest.raises(ConfigurationError, match="settings of the camera in the manifest: colour_noise must be"):
+        logged_run(row, steps, {"colour_noise": -1.0})
 
 
 def test_settings_of_another_version_are_passed_over(result):
-    assert logged_run(result.row, result.steps, {"width": 64, "height": 48, "new_in_2030": 1}).config.width == 64
+    assert logged_run(result.row, result.steps, {"colour_noise": 9.0, "new_in_2030": 1}).config.colour_noise == 9.0
 
 
 def run_on(monkeypatch, folder, text, *arguments):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 
 import gymnasium
@@ -41,6 +42,17 @@ def test_an_episode_under_the_commands_of_a_run_is_that_run(sensing):
     env.close()
 
 
+def test_an_environment_can_be_sent_to_another_process_before_and_during_an_episode():
+    env = ServoEnv(task="exp1")
+    fresh = pickle.loads(pickle.dumps(env))
+    seen = env.reset(seed=3)[0]
+    np.testing.assert_array_equal(fresh.reset(seed=3)[0], seen)
+    copied, action = pickle.loads(pickle.dumps(env)), np.full(6, 0.5)
+    np.testing.assert_array_equal(copied.step(action)[0], env.step(action)[0])
+    for each in (env, fresh, copied):
+        each.close()
+
+
 def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
     many = gymnasium.make_vec(ENVIRONMENT, num_envs=3, vectorization_mode="vector_entry_point", task="exp1")
     singles = [ServoEnv(task="exp1") for _ in range(3)]
@@ -63,6 +75,16 @@ def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
     assert not np.any([rewards, terminated, truncated])
     assert len(set(info["seed"].tolist()) | {5, 6, 7}) == 6
     assert again.shape == seen.shape
+    seen, info = many.reset(seed=[11, 5, None])
+    assert info["seed"].tolist()[:2] == [11, 5]
+    pairs = zip(singles, info["seed"], strict=True)
+    np.testing.assert_array_equal(seen, [env.reset(seed=int(each))[0] for env, each in pairs])
+    later = many.reset()[1]["seed"]
+    assert many.reset(seed=np.array([11, 5, 3]))[1]["seed"].tolist() == [11, 5, 3]
+    assert many.reset(seed=(11, 5, None))[1]["seed"].tolist() == info["seed"].tolist()  # the third is drawn likewise
+    assert many.reset()[1]["seed"].tolist() == later.tolist()
+    with pytest.raises(ConfigurationError, match="seed must be a number or a list of 3, got 2 seeds"):
+        many.reset(seed=[1, 2])
     many.close()
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from kit.command import judged
+from kit.command import judged, servobench
 from kit.folders import made_up_row
 from servobench.harness.batch import results, tables
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
@@ -68,6 +68,49 @@ def whole(tmp_path_factory):
     assert (found.findings, found.runs, found.wanted) == ([], RUNS, RUNS)
     assert found.files == 3  # runs, failures, manifest
     return folder
+
+
+def test_verify_covers_the_files_beside_the_tables_and_names_the_rest(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "out"
+    run(folder, steps=True)
+    for name in ("figures/paths.png", "report.html"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(name)
+    results.vouch(folder, [folder / "figures" / "paths.png", folder / "report.html"])
+    (folder / "notes.txt").write_text("mine")
+    run(folder / "inside", seeds=range(2))
+    found = examine(folder)
+    assert (found.findings, found.left_out) == ([], ["inside/", "notes.txt"])
+    assert servobench(monkeypatch, "verify", str(folder)) == 0
+    assert "not checked, as SHA256SUMS does not list it: inside/, notes.txt\n" in capsys.readouterr().out
+    (folder / "figures" / "paths.png").unlink()
+    (folder / "report.html").write_text("other")
+    assert [(each.name, each.fault) for each in examine(folder).findings] == [
+        ("figures/paths.png", "is missing"), ("report.html", "was changed since it was written"),
+    ]  # fmt: skip
+    assert servobench(monkeypatch, "verify", str(folder)) == 1
+    run(folder, resume=True, steps=True)  # leaves the lines of these files as they are
+    assert len(examine(folder).findings) == 2
+
+
+def test_networks_of_a_batch_are_vouched_for_when_it_ends(tmp_path):
+    folder = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, Stop())
+    (folder / "networks").mkdir()
+    (folder / "networks" / "networks-1.npz").write_bytes(b"1")
+    assert examine(folder).left_out == ["networks/networks-1.npz"]
+    run(folder, resume=True)
+    assert examine(folder).left_out == []
+    (folder / "networks" / "networks-1.npz").write_bytes(b"2")
+    assert [each.name for each in examine(folder).findings] == ["networks/networks-1.npz"]
+
+
+def test_resume_begins_a_batch_whose_folder_was_never_made(tmp_path):
+    begun = run(tmp_path / "never", resume=True)
+    assert begun.repeated == RUNS
+    assert f"{tmp_path / 'never'} holds no runs to continue; all are carried out" in begun.notes
+    assert examine(tmp_path / "never").runs == RUNS
 
 
 @pytest.fixture(scope="module")

@@ -115,7 +115,6 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*COMPARE, "--workers", "0"), "--workers"),
     ((*COMPARE, "--run-timeout", "0"), "--run-timeout"),
     ((*COMPARE, "--resume"), "--resume needs --out, the folder to continue in"),
-    ((*COMPARE, "--resume", "--out", "none"), "none is not a results folder"),
     ((*COMPARE, "--debug", "--workers", "2"), "one by one in this process; leave --workers away"),
     ((*COMPARE, "--scheduler", "here"), "--scheduler needs an address such as tcp://127.0.0.1:8786, got 'here'"),
     ((*COMPARE, "--scheduler", "tcp://x:1", "--workers", "2"), "--workers are processes of this machine"),

@@ -1,7 +1,5 @@
 """Model predictive control with a frozen Jacobian: eq. 46 generalised to free moves, preview and limits."""
 
-from __future__ import annotations
-
 import math
 from typing import Final, Literal, NamedTuple, final
 

@@ -16,8 +16,6 @@ Every solve starts cold, so that a solution depends on its arguments alone: the 
 DAQP a sixth of its time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math

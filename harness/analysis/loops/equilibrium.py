@@ -13,8 +13,6 @@ offset of the reference; where a posture term moves the arm, both move. Neither 
 here; only the motions are small.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace

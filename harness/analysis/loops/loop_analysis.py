@@ -11,8 +11,6 @@ Pintelon, *System Identification: A Frequency Domain Approach*, chapters 2 and 5
 feedforward of it does not pass for feedback. Adaptation in the small motions is part of the response.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, final

@@ -21,8 +21,6 @@ and, for channels that change each by itself, with S = (I + L)⁻¹ and T = L S,
 α is the balanced one for unstructured changes: a lower bound of that for diagonal ones, and equal to it in one channel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise

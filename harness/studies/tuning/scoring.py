@@ -6,8 +6,6 @@ A ledger is a file that a killed process leaves readable. Each line is a JSON ob
 that scores depend on besides the settings, each other one the settings of a point and the cost of every run.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

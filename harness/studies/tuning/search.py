@@ -5,8 +5,6 @@ and the number of the trial, so that a study given the same scores asks for the 
 repeated with the scores of the ledger up to where it stopped. There is no pruning.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Generator, Iterator, Mapping, Sequence

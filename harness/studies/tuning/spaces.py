@@ -17,8 +17,6 @@ the camera, and tuned where its model of the delay is exact it gains nothing (0.
 around the target on the rendered plant, whose joints answer one period earlier.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping
 from typing import Any, Final, TypeAlias
