@@ -142,12 +142,8 @@ class CfdlEstimator(Estimator[CfdlState]):
             return state
         flat, first = J.reshape(*J.shape[:-2], -1), state.J0.reshape(*J.shape[:-2], -1)
         lost = (np.vecdot(flat, first) <= 0.0) | (np.vecdot(flat, flat) < config.reset_norm**2)
-        return branch(lost, _restarted, state)
+        return branch(lost, lambda lost: lost._replace(J=lost.J0, resets=lost.resets + 1.0), state)
 
     def diagnostics(self, state: CfdlState) -> Diagnostics:
         """Return whether the last motion was used and how often Φ was reset in this run."""
         return {"estimator_updated": state.updated, "jacobian_resets": state.resets}
-
-
-def _restarted(state: CfdlState) -> CfdlState:
-    return state._replace(J=state.J0, resets=state.resets + 1.0)

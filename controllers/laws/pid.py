@@ -93,7 +93,7 @@ class PidLaw(Law[PidState]):
         """Hold an integral that grows while the command is limited."""
         integral, before = state.integral, state.integral_before
         winds_up = limited & (np.vecdot(integral, integral) >= np.vecdot(before, before))
-        return branch(winds_up, _hold_integral, state)
+        return branch(winds_up, lambda winding: winding._replace(integral=winding.integral_before), state)
 
     def diagnostics(self, state: PidState) -> Diagnostics:
         """Return the norm of the integral, m s."""
@@ -107,7 +107,3 @@ class PidLaw(Law[PidState]):
     def _differentiate(self, state: PidState, e: FloatArray) -> PidState:
         tau = self._config.derivative_filter
         return state._replace(derivative=(tau * state.derivative + e - state.last_error) / (tau + self._dt))
-
-
-def _hold_integral(state: PidState) -> PidState:
-    return state._replace(integral=state.integral_before)

@@ -130,7 +130,8 @@ class Estimation:
         jacobian = own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
-        last = branch(due, _newest, last, LastFrame(time, q, observation.feature, observation.valid, jacobian))
+        this = LastFrame(time, q, observation.feature, observation.valid, jacobian)
+        last = branch(due, lambda _, newer: newer, last, this)
         return EstimationState(learned, last, jacobian, own)
 
     def ahead(self, state: EstimationState, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -212,7 +213,3 @@ class Estimation:
         learned = state.learned
         found = {"jacobian_prediction_error": learned.unexplained, **self.estimator.diagnostics(learned.estimator)}
         return found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
-
-
-def _newest(last: LastFrame, now: LastFrame) -> LastFrame:
-    return now

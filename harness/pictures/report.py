@@ -8,7 +8,6 @@ numbers that `space.js` and `report.js` draw. `notebooks/analysis.ipynb` shows t
 import base64
 import hashlib
 import re
-from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -103,18 +102,13 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
 def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
     pictures, size = [], 0
-    for picture in _drawn(folder, runs):
-        size += len(picture.wide.data) + len(picture.narrow.data)
-        if size > PICTURE_BYTES:
-            break
-        pictures.append(picture)
-    return pictures
-
-
-def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
     for named, slim in page_figures(folder, runs, [name for name, kind in KINDS.items() if kind.in_page]):
         wide, narrow = drawing_of(named.figure, WIDE), drawing_of(slim.figure, NARROW)
-        yield Picture(named.kind, named.title, named.tasks, wide, narrow)
+        size += len(wide.data) + len(narrow.data)
+        if size > PICTURE_BYTES:
+            break
+        pictures.append(Picture(named.kind, named.title, named.tasks, wide, narrow))
+    return pictures
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:

@@ -163,11 +163,8 @@ class Instance(ABC):
         """Go through initialisation, to begin at `time`."""
 
     @abstractmethod
-    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """Return a function that takes a step of size `step`, s, at the time `now`, s; both are read at every call.
-
-        It returns 0 where the step was taken without anything to report; any other result is for `finish`.
-        """
+    def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """Return the `step_call` of co-simulation."""
 
     @abstractmethod
     def update_discrete_states(self) -> tuple[bool, bool, float]:
@@ -177,8 +174,14 @@ class Instance(ABC):
             Whether it has to be repeated, whether the FMU wants to end, and the time of the next event, s.
         """
 
-    def _integrated(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """Return the `step_call` of model exchange, which raises FmuError instead of returning a bad status."""
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """Return a function that takes a step of size `step`, s, at the time `now`, s; both are read at every call.
+
+        It returns 0 where the step was taken without anything to report; any other result is for `finish`. That of
+        model exchange raises FmuError instead of returning a bad status.
+        """
+        if not self.description.exchange:
+            return self._do_step(now, step)
 
         def advance() -> int:
             self._integrator.advance(now.value, step.value)

@@ -232,10 +232,7 @@ class Instance2(Instance):
         self.call("EnterInitializationMode")
         self.call("ExitInitializationMode")
 
-    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """See `Instance.step_call`."""
-        if self.description.exchange:
-            return self._integrated(now, step)
+    def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         return partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
@@ -326,10 +323,7 @@ class Instance3(Instance):
         self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")
 
-    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """See `Instance.step_call`."""
-        if self.description.exchange:
-            return self._integrated(now, step)
+    def _do_step(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         end, early = self._end, self._early
         results = [ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)]
         call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results)

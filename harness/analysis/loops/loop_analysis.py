@@ -339,9 +339,9 @@ def latency_border(
     config: Any,  # noqa: ANN401 - the settings of any composed controller
     name: str,
     latencies: Sequence[float],
-    run: RunSettings | None = None,
-    plant: KinematicConfig | None = None,
-    robot: str = DEFAULT_ROBOT,
+    run: RunSettings,
+    plant: KinematicConfig,
+    robot: str,
 ) -> float:
     """Return the latency of the camera [s] from which on a loop is predicted to be unstable; inf if none is.
 
@@ -355,9 +355,9 @@ def latency_border(
         plant: lag, delays and noise; its latency is replaced.
         robot: name, or the path of a file.
     """
-    world, border = plant or KinematicConfig(), 0.0
+    border = 0.0
     for latency in latencies:
-        later = replace(world, sensing=replace(world.sensing, latency=latency))
+        later = replace(plant, sensing=replace(plant.sensing, latency=latency))
         margin = delay_margin(config, name, run, later, robot)
         if margin == 0.0:
             return min(border, latency)
