@@ -119,8 +119,8 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log.
     """
+    from servobench.harness.analysis.exports import write_csv
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
-    from servobench.harness.batch.tables import write_csv
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see

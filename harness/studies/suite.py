@@ -18,12 +18,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import column_of, outcomes
+from servobench.harness.analysis.exports import write_csv
 from servobench.harness.analysis.scores import profile, ranking, resolution, scores
 from servobench.harness.analysis.statistics import median_with_interval, success_rate
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
-from servobench.harness.batch.tables import write_csv
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import (
     TEXT,
