@@ -13,10 +13,9 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
-from servobench.harness.batch.tables import write_csv
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason, write_atomically
+from servobench.plant.contract.files import reason, write_atomically, write_csv
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)

@@ -17,12 +17,10 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.request import SHORT_NAMES
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically
 
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
 MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table, whatever its size, and by the size of its file
-FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
@@ -81,17 +79,6 @@ def as_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
         return made.cast(pa.float64()) if pa.types.is_null(made.type) and numbers else made
 
     return pa.table({name: column(name) for name in dict.fromkeys(name for row in rows for name in row)})
-
-
-def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV, atomically; a text that a spreadsheet would run as a formula begins with an apostrophe."""
-
-    def quoted(cell: Any) -> Any:  # noqa: ANN401 - a cell of any kind
-        return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell
-
-    texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
-    safe = table.assign(**texts).rename(columns=quoted)
-    write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
 
 def write_table(table: pa.Table, path: Path, batch: str = "") -> None:

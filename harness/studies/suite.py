@@ -23,7 +23,6 @@ from servobench.harness.analysis.statistics import median_with_interval, success
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
-from servobench.harness.batch.tables import write_csv
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import (
     TEXT,
@@ -38,6 +37,7 @@ from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.resolution import check_settings, resolve_sections
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
+from servobench.plant.contract.files import write_csv
 
 MAX_REFERENCE_LOSS: Final = 0.05
 REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see the images of all methods
