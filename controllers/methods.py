@@ -4,13 +4,11 @@ A plain name is the method with all aids that help it; `NAME:published` has none
 is a method too, called `law+estimator`. Method numbers and equations in the summaries are the paper's.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
@@ -87,7 +85,7 @@ class Method:
     estimator_defaults: Mapping[str, object] = field(default_factory=dict)
     network_defaults: Mapping[str, Any] = field(default_factory=dict)
 
-    def divisions(self) -> list[Method]:
+    def divisions(self) -> list[Self]:
         """Return the method best equipped and, where there is one, as published: without aids, its law as printed."""
         if self.printed is None:
             return [self]

@@ -13,10 +13,8 @@ delay at which it happens to be smallest. The first sample of the noise σ is a 
 the motions that the delay pairs then gives the Jacobian.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Final, NamedTuple, final
+from typing import Final, NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
@@ -72,7 +70,7 @@ class Candidates:
         self._around = (self._whole, self._whole + 1) if self._share.any() else (self._whole,)
 
     @classmethod
-    def up_to(cls, longest: float, period: float) -> Candidates:
+    def up_to(cls, longest: float, period: float) -> Self:
         """Return delays from 0 to the longest one [s], with control periods of `period` [s].
 
         They lie about `RESOLUTION` apart: a whole number of periods, or a period divided by a whole number.

@@ -13,12 +13,10 @@ exposure, d periods ago, as measured, or without the noise e that the regression
 Prediction and filter can each be left out.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace
-from typing import NamedTuple, final
+from typing import NamedTuple, Self, final
 
 import numpy as np
 
@@ -68,7 +66,7 @@ class Predictor:
         self._share: float | None = None
         self._length = max(1, whole_periods(aids.response_length, period))
 
-    def frozen(self, share: float) -> Predictor:
+    def frozen(self, share: float) -> Self:
         """Return a copy that predicts from a state of this stage with identification switched off.
 
         Args:

@@ -9,7 +9,6 @@ from pyarrow import ArrowException
 
 from servobench.controllers.aids import describe_aids
 from servobench.harness.batch import results
-from servobench.harness.batch.tables import read_tables
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
@@ -92,7 +91,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         if own or path.suffix not in (".parquet", ".csv"):
             continue
         try:
-            table = pd.read_csv(path) if path.suffix == ".csv" else read_tables(folder, [path.name])
+            table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
         except (OSError, ValueError, ArrowException, OverflowError) as error:
             why = " ".join(str(error).split())
             raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error

@@ -157,7 +157,7 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
 
 
 def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
-    seeds = {name: set(own["seed"]) for name, own in runs.groupby("controller", sort=False)}
+    seeds = {str(name): set(own["seed"]) for name, own in runs.groupby("controller", sort=False)}
     pairs = [pair for pair in combinations(seeds, 2) if seeds[pair[0]] & seeds[pair[1]]]  # a batch may be unfinished
     if not pairs and metric is None:
         return []

@@ -10,8 +10,6 @@ may have suffered from an earlier one in the same process. As a block is never s
 costs at most the time of the runs once more. The one module that imports Dask.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import pickle
@@ -24,7 +22,7 @@ from dataclasses import astuple, dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -87,11 +85,11 @@ class Block:
         """Index of the first run."""
         return self.jobs[0].index
 
-    def singly(self) -> list[Block]:
+    def singly(self) -> list[Self]:
         """Return each run as a block of its own."""
         return [replace(self, jobs=(job,), together=False) for job in self.jobs]
 
-    def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Block:
+    def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Self:
         """Return some of the runs as a block."""
         return replace(self, jobs=self.jobs[begin:end], fresh=fresh)
 

@@ -6,8 +6,6 @@ created it holds it, until that process is known to have ended. The processes of
 there the file stays until a user removes it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl
@@ -19,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
@@ -41,13 +39,13 @@ class Holder:
     started: str  # of the process, as the system counts; a later process with the same number differs here
 
     @classmethod
-    def this_process(cls) -> Holder:
+    def this_process(cls) -> Self:
         """Return the entry of this process in a lock."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         return cls(_user(), platform.node(), os.getpid(), now, _start_of(os.getpid()))
 
     @classmethod
-    def read(cls, file: Path) -> Holder | None:
+    def read(cls, file: Path) -> Self | None:
         """Return the holder that a lock names; None where it names none."""
         try:
             content = json.loads(file.read_text(encoding="utf-8"))

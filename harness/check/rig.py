@@ -1,7 +1,5 @@
 """The bench of `check`: an arm of any size, y = A (q + 0.02 q³), and a driver that steps a controller on it."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import traceback
@@ -10,7 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -145,7 +143,7 @@ class Driver:
         self._held = HeldController(controller, rig.spec)
         self.times: list[float] = []  # [s] of each step
 
-    def begin(self) -> Driver:
+    def begin(self) -> Self:
         """Reset the controller."""
         conditions, goal = self.rig.conditions, self.rig.feature(self.rig.goal)
         desired = conditions.scale * np.tile(goal, (MAX_PERIODS + conditions.preview, 1))

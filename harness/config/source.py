@@ -1,7 +1,5 @@
 """Python files and modules of users: found, read, executed, sent to other processes; their errors as one line."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import importlib
@@ -17,7 +15,7 @@ from functools import cache, cached_property
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Final, TypeAlias
+from typing import Final, Self, TypeAlias
 
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import reason, user_path
@@ -46,7 +44,7 @@ class SourceFile:
     text: str
 
     @classmethod
-    def read(cls, given: str) -> SourceFile:
+    def read(cls, given: str) -> Self:
         """Read a file.
 
         Raises:

@@ -1,7 +1,5 @@
 """The appearance of every figure: colour, line and marker of each method, legend, axes and files; readable in grey."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math
@@ -11,7 +9,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import matplotlib as mpl
 import numpy as np
@@ -83,7 +81,7 @@ class Layout:
     density: float  # pixels of a picture for each of the page's
 
     @classmethod
-    def of_width(cls, text: str) -> Layout:
+    def of_width(cls, text: str) -> Self:
         """Return the layout of a width such as `3.5in` or `89mm`; one below 5 in has its panels in one column.
 
         Raises:

@@ -4,14 +4,12 @@ A `Track` has the steps of one run, an `Ensemble` the runs of one controller ove
 medians and bands.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Self, final
 
 import numpy as np
 import pandas as pd
@@ -85,11 +83,11 @@ class Track(Shown):
         """Whether the run has too many rows to draw them one by one."""
         return len(self.table) > LONG
 
-    def overview(self) -> Track:
+    def overview(self) -> Self:
         """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
         return self.thinned(len(self.table) // OVERVIEW) if self.long else self
 
-    def thinned(self, step: int) -> Track:
+    def thinned(self, step: int) -> Self:
         """Return the track with every `step`-th row, which has the root mean square of errors over these rows."""
         if step == 1:
             return self
@@ -98,13 +96,13 @@ class Track(Shown):
             if name in few:
                 means = (self.table[name] ** 2).groupby(np.arange(len(self.table)) // step).mean()
                 few[name] = np.sqrt(means.to_numpy())
-        return Track(self.row, few)
+        return replace(self, table=few)
 
-    def closing(self) -> Track:
+    def closing(self) -> Self:
         """Return the end of a long track, row by row."""
-        return Track(self.row, self.table.iloc[-CLOSING:].reset_index(drop=True)) if self.long else self
+        return replace(self, table=self.table.iloc[-CLOSING:].reset_index(drop=True)) if self.long else self
 
-    def for_path(self) -> Track:
+    def for_path(self) -> Self:
         """Return the rows that show the path in space: of a curve that is followed for long, the end."""
         return self.overview() if self.point_to_point else self.closing()
 

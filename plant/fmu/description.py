@@ -4,8 +4,6 @@ A name stands for a scalar, for an FMI 3 array, or for all scalars `name[1]`, `n
 that one mapping serves both versions of a model.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -15,7 +13,7 @@ from functools import cached_property, lru_cache
 from math import prod
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from servobench.plant.contract.settings import suggest
 from servobench.plant.fmu.archive import DESCRIPTION
@@ -132,7 +130,7 @@ class FmuDescription:
         """Return the variables that `names` stand for, in order; arguments and errors as of `find`."""
         return tuple(variable for name in names for variable in self.find(name, role, types))
 
-    def resized(self, sizes: Mapping[str, int]) -> FmuDescription:
+    def resized(self, sizes: Mapping[str, int]) -> Self:
         """Return the description with other values of structural parameters, which give the sizes of arrays."""
         if not sizes:
             return self

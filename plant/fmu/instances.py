@@ -5,8 +5,6 @@ then the next; a call returns a status, which is 0 unless there is something to 
 called again.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os
@@ -15,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -50,7 +48,7 @@ class Lane:
     read_truth: RawCall
     states: list[ctypes.c_void_p] = field(default_factory=list)
 
-    def resting(self) -> Lane:
+    def resting(self) -> Self:
         """Return the lane with calls that do nothing, for an instance that has failed."""
         return replace(self, write=_nothing, step=_nothing, read=_nothing, read_truth=_nothing)
 

@@ -4,8 +4,6 @@ A target of one point is the red ball, one of three or four points a plate with 
 cross of thin rods with a white pad behind each disc, so that it hides nothing and a disc stands out in every posture.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final, Self
 from xml.etree import ElementTree as ET
@@ -65,7 +63,7 @@ class Rig:
     ball_radius: float
 
     @classmethod
-    def of(cls, model: SetupModel, robot: Robot) -> Rig | None:
+    def of(cls, model: SetupModel, robot: Robot) -> Self | None:
         """Return the rig of a set-up; None where it is the ball on the flange, which every arm carries.
 
         Raises:

@@ -9,11 +9,9 @@ UR5's links. A joint's torque limit is 1.5 times the torque that holds the stret
 gravity; a UR5 has 1.2 times this torque in its shoulder and more in its wrists.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -110,7 +108,7 @@ class Robot:
         """Size and focal length of the image as planned."""
         return CAMERA if self.camera is None else self.camera.pinhole
 
-    def equipped(self, camera: OwnCamera) -> Robot:
+    def equipped(self, camera: OwnCamera) -> Self:
         """Return the robot with a camera and a target of the user."""
         target, work, arm, measured = camera.keys.target, self.workspace, self.arm, self.measured
         if target.frame == "flange":

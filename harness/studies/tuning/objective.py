@@ -17,12 +17,10 @@ that leaves the settling band late costs hardly more than one that does not. Eac
 cost of an approach grows in proportion to its settling time. A curve's cost is the logarithm of its judged error.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, Self, TypeAlias
 
 import numpy as np
 
@@ -111,9 +109,10 @@ class TuningSet:
             if entry.own_robot or not isinstance(getattr(entry.config(), "sensing", None), SensingConfig):
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
-    def second(self) -> TuningSet:
+    def second(self) -> Self:
         """Return the second, larger set: other robots of the tuning range, which no trial uses."""
-        return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
+        offset = (self.offset + SECOND_OFFSET) % len(TUNING)
+        return replace(self, robots=SECOND_FACTOR * self.robots, offset=offset)
 
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
