@@ -30,6 +30,7 @@ and signatures. `install` shows how to install servobench with extras: once a re
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import importlib
@@ -315,7 +316,7 @@ def interface(names: list[str]) -> str:
             methods = (each for key, each in vars(thing).items() if inspect.isfunction(each) and key[0] != "_")
             inner = [f"{documented(defined(each), inspect.getdoc(each).partition(NEW_LINE)[0])}\n" for each in methods]
         else:
-            inner = [unquoted(str(each)) for each in inspect.signature(thing).parameters.values()]
+            inner = [unquoted(str(each)) for each in written_signature(thing).parameters.values()]
         whole = documented(*lines) + (
             "\n\n" + textwrap.indent("\n".join(inner), "    ") if isinstance(thing, type) else ""
         )
@@ -327,7 +328,7 @@ def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
     """Return the line, or lines, that begin the definition of a function or a class."""
     if isinstance(thing, type):
         return f"class {thing.__name__}:"
-    found = inspect.signature(thing)
+    found = written_signature(thing)
     line = f"def {thing.__name__}{unquoted(str(found))}:"
     if len(line) <= LINE:
         return line
@@ -339,6 +340,24 @@ def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
     together = f"    {', '.join(arguments)}"
     lines = [together] if len(together) <= LINE else [f"    {each}," for each in arguments]
     return "\n".join([f"def {thing.__name__}(", *lines, end])
+
+
+def written_signature(thing: Any) -> inspect.Signature:  # noqa: ANN401 - a function or a class
+    """Return the signature with annotations as the source has them, whether or not Python evaluates them."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
+    found = inspect.signature(thing)
+    texts: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            texts.setdefault(node.target.id, ast.unparse(node.annotation))
+        elif isinstance(node, ast.arg) and node.annotation:
+            texts.setdefault(node.arg, ast.unparse(node.annotation))
+    head = tree.body[0]
+    returned = (
+        ast.unparse(head.returns) if isinstance(head, ast.FunctionDef) and head.returns else found.return_annotation
+    )
+    arguments = [each.replace(annotation=texts.get(name, each.annotation)) for name, each in found.parameters.items()]
+    return found.replace(parameters=arguments, return_annotation=returned)
 
 
 def unquoted(signature: str) -> str:
