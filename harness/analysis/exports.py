@@ -15,25 +15,13 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason, write_atomically
+from servobench.plant.contract.files import reason, write_atomically, write_csv
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
 NANOSECONDS: Final = 1e9  # in a second
 TOPICS: Final = ("reference", "feature", "true_feature", "joint_position", "joint_velocity_command", "diagnostic")
-FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 KEYS: Final = ("run_id", "step", "time_s")  # columns that say where a row belongs
-
-
-def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV, atomically; a text that a spreadsheet would run as a formula begins with an apostrophe."""
-
-    def quoted(cell: Any) -> Any:  # noqa: ANN401 - a cell of any kind
-        return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell
-
-    texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
-    safe = table.assign(**texts).rename(columns=quoted)
-    write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
 
 def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:

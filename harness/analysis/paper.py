@@ -1,10 +1,8 @@
 """A results folder in LaTeX: its tables with booktabs, and a paragraph *Methods* with its BibTeX entry."""
 
-import json
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
-from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,11 +11,6 @@ import pandas as pd
 from servobench.harness.analysis.folder import describe_folder
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.batch import results
-from servobench.harness.config.installation import installed_version
-from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import resolve_sections
-from servobench.plant.contract.faults import ConfigurationError
 
 SIGNS: Final = str.maketrans(
     {sign: f"\\{sign}" for sign in "_%&#${}"}
@@ -109,33 +102,16 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
         "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
         "test on lost runs and of two one-sided t-tests (5 %) against the stated margin",
-        _settings(manifest, version),
+        _settings(manifest.get("changed")),
     ]
     text = [sentences[0], *(each.translate(SIGNS) for each in sentences[1:])]
     year = str(manifest.get("created", ""))[:4]
     return rf"\paragraph{{Methods}} {'. '.join(text)}." + "\n\n" + BIBTEX % (year, f"{version}, commit {commit}")
 
 
-def _settings(manifest: Mapping[str, Any], version: str) -> str:
-    """Return a sentence on settings that differ from their defaults."""
-    unknown = "All settings are in the file manifest.json of the results"
-    if version != installed_version("servobench"):
-        return unknown
-    try:
-        changed = [f"{key} = {value}" for key, value in _changed(manifest)]
-    except ConfigurationError:  # controllers, plants or tasks of somebody else that are not here
-        return unknown
-    which = f"Settings other than the defaults of this version: {', '.join(changed)}" if changed else ""
-    return which or "All settings are the defaults of this version"
-
-
-def _changed(manifest: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the key and the value of each setting that is not the default."""
-    names = product(manifest["plants"], manifest["controllers"], manifest["tasks"])
-    robot, sensing = manifest["robots"][0]["name"], manifest["sensings"][0]["name"]
-    requests = [RunRequest(*each, manifest["mismatches"][0], 0, robot=robot, sensing=sensing) for each in names]
-    for section, config in resolve_sections(requests, Settings({}), to_run=False).items():
-        default = json.loads(results.encode(flatten(config)))
-        for key, value in manifest["configuration"].get(section, {}).items():
-            if value != default.get(key):
-                yield f"{section}.{key}", value
+def _settings(changed: Mapping[str, Any] | None) -> str:
+    """Return a sentence on settings that were changed; None if the manifest does not tell."""
+    if changed is None:
+        return "All settings are in the file manifest.json of the results"
+    pairs = ", ".join(f"{key} = {value}" for key, value in changed.items())
+    return f"Settings other than the defaults: {pairs}" if pairs else "All settings are the defaults of this version"

@@ -149,7 +149,7 @@ def _carry_out_at(
     sections = check_campaign(campaign, runs, how.observer, place)
     jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
     side_by_side = jobs.side_by_side(runs.examples)
-    manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
+    manifest = describe_batch(runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
     with locked(folder) as lock:

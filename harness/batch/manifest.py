@@ -46,6 +46,7 @@ OWN = {  # keys of the place and the hash of a file or an object of users, by it
 def describe_batch(
     runs: Survey,
     sections: Mapping[str, Any],
+    changed: Mapping[str, Any],
     side_by_side: Mapping[str, list[str]],
     own: Sequence[Offer] = (),
     *,
@@ -56,6 +57,7 @@ def describe_batch(
     Args:
         runs: of the batch.
         sections: their typed settings by section, as `servobench.harness.run.resolution.resolve_sections` returns them.
+        changed: overrides of the defaults by section.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
         own: controllers and plants that users gave.
         steps: the table of steps is kept, too.
@@ -75,6 +77,7 @@ def describe_batch(
         "sensings": [describe_sensing(word) for word in runs.sensings],
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
+        "changed": flatten(changed),
         "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
         "packages": {name: installed_version(name) for name in PACKAGES},
         "python": platform.python_version(),

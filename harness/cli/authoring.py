@@ -16,7 +16,7 @@ from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import write_atomically, write_csv
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
@@ -119,7 +119,6 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log.
     """
-    from servobench.harness.analysis.exports import write_csv
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.shadow import differences, has_commands

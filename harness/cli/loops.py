@@ -48,9 +48,9 @@ def analyse(
 
     Also sensitivity, and stability over gain and latency.
     """
-    from servobench.harness.analysis.exports import write_csv
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
+    from servobench.plant.contract.files import write_csv
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []

@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import column_of, outcomes
-from servobench.harness.analysis.exports import write_csv
 from servobench.harness.analysis.scores import profile, ranking, resolution, scores
 from servobench.harness.analysis.statistics import median_with_interval, success_rate
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
@@ -38,6 +37,7 @@ from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.resolution import check_settings, resolve_sections
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
+from servobench.plant.contract.files import write_csv
 
 MAX_REFERENCE_LOSS: Final = 0.05
 REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see the images of all methods

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -30,6 +31,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not be imported here
+    """Write a DataFrame as CSV, atomically; a text that a spreadsheet would run as a formula gets an apostrophe."""
+
+    def quoted(cell: Any) -> Any:  # noqa: ANN401 - a cell of any kind
+        return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell
+
+    texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
+    safe = table.assign(**texts).rename(columns=quoted)
+    write_atomically(path, lambda partial: safe.to_csv(partial, index=False))
 
 
 def read_toml(kind: str, path: Path) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
     tuned("[settings.law]\ngain = 3.0\nstep_weight = 0.05\n")
     settings = Settings({"ukf_mfac": {"law": {"gain": 4.0}}})
     requests = [RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)]
-    manifest = describe_batch(survey(requests), resolve_sections(requests, settings), {})
+    manifest = describe_batch(survey(requests), resolve_sections(requests, settings), settings.sections, {})
     assert manifest["configuration"]["ukf_mfac"]["law.gain"] == 4.0
     assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
 

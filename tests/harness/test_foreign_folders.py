@@ -18,9 +18,9 @@ import pytest
 
 from kit.command import servobench
 from kit.folders import MANIFEST, comparison, made_up_row, made_up_steps, write_folder
-from servobench.harness.analysis import exports
 from servobench.harness.batch import results, tables
 from servobench.harness.run.result import RunResult
+from servobench.plant.contract import files
 from servobench.plant.contract.checksums import SUMS, write_vouched
 
 RUN = "kinematic-constant-exp1-moderate-0"
@@ -159,7 +159,7 @@ def test_a_spreadsheet_runs_no_cell_of_an_export(tmp_path, monkeypatch):
     runs = pd.read_csv(tmp_path / "csv" / "runs.csv")
     assert runs.loc[0, "controller"] == "'=cmd|'/C calc'!A1"
     assert runs.loc[0, "'=1+1"] == "'@x"
-    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(exports.FORMULA)).any(axis=None)
+    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(files.FORMULA)).any(axis=None)
     assert runs.loc[0, "seed"] == 0
 
 
