@@ -8,7 +8,7 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 """
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, final
+from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, pick, transposed
-from servobench.plant.contract.settings import Count, Number, Periods, Positive, settings
+from servobench.plant.contract.settings import Count, Number, Periods, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
 State = TypeVar("State")
@@ -30,7 +30,7 @@ class InitialConfig:
 
     source: Literal["nominal", "probe", "given"] = "nominal"
     """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
-    probe_step: Positive = 0.03
+    probe_step: Annotated[Positive, Usual(0.3)] = 0.03
     """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
     probe_periods: Count = 2
     """[periods] over which a probing move is spread."""

@@ -367,6 +367,9 @@ def _check_times(resolved: ResolvedRun, duration: float) -> None:
     if isinstance(sensing, SensingConfig):
         names = ("latency", "jitter", "frame_period", "latency_swing")
         times |= {f"{plant}.sensing.{name}": getattr(sensing, name) for name in names}
+        if late := [begin for begin, _ in sensing.occlusion_windows if begin >= duration]:
+            where = f"{plant}.sensing.occlusion_windows"
+            raise ConfigurationError(f"{where} must begin within the run of {duration:g} s, got {late[0]:g} s")
     for name, time in times.items():
         if isinstance(time, float) and time > 0.0 and time >= duration:
             meant = likely_meant(time, "s", lambda other: other < duration)

@@ -25,14 +25,14 @@ import re
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import radians
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE, sensor_settings
-from servobench.plant.contract.settings import likely_meant, nearest, suggest
+from servobench.plant.contract.settings import likely_meant, nearest, remark, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
 from servobench.plant.robot.mechanics import MECHANICS_AXES
@@ -345,6 +345,9 @@ PROFILES: dict[str, dict[str, float]] = {
 }
 
 
+USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
+
+
 @dataclass(frozen=True)
 class Magnitude:
     """The magnitude of one axis, such as 60deg; `str` returns it with its unit."""
@@ -369,7 +372,9 @@ class Magnitude:
         if match is None:
             raise _not_a_magnitude(axis, text)
         magnitude = cls(float(match[1]), match[2])
-        magnitude.size(axis)
+        size = magnitude.size(axis)
+        if not magnitude.unit and size > USUAL_SHARE:
+            remark(f"{axis}={text} is {size:.0%}; if {magnitude}% is meant, write the unit, too")
         return magnitude
 
     def size(self, axis: str) -> float:

@@ -14,6 +14,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.units import UNITS, in_own_unit, in_unit, split_quantity, units_of
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.mismatch import Mismatch
 
 DEFAULTS = {"kinematic": KinematicConfig(), "run": RunSettings()}
 
@@ -91,3 +92,12 @@ def test_times_and_angles_of_likely_other_units_are_remarked_on(assignment, capl
     remark.cache_clear()
     read(assignment)
     assert f"{assignment.replace('=', ' is ')}, and usually at most" in caplog.text
+
+
+def test_a_plain_share_that_is_likely_one_of_percent_is_remarked_on(caplog):
+    remark.cache_clear()
+    Mismatch.parse("gear_ratio=0.5")
+    assert "gear_ratio=0.5 is 50%; if 0.5% is meant, write the unit, too" in caplog.text
+    caplog.clear()
+    Mismatch.parse("links=50%+gear_ratio=0.05")
+    assert not caplog.text
