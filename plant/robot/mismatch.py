@@ -373,7 +373,7 @@ class Magnitude:
             raise _not_a_magnitude(axis, text)
         magnitude = cls(float(match[1]), match[2])
         size = magnitude.size(axis)
-        if not magnitude.unit and size > USUAL_SHARE:
+        if not magnitude.unit and "%" in AXES[axis][0] and USUAL_SHARE < size < 1.0:
             remark(f"{axis}={text} is {size:.0%}; if {magnitude}% is meant, write the unit, too")
         return magnitude
 
