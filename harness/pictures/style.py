@@ -56,14 +56,9 @@ LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of its 
 MARGIN: Final = 0.2  # [in] on both sides of the legend
 DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
 JOINTS: Final = (
-    (BLUE, "-"),
-    (VERMILION, (0, (4, 1))),
-    (GREEN, "-."),
-    (ORANGE, (0, (6, 1, 1, 1))),
-    (PURPLE, (0, (2, 1))),
-    (SKY, "-"),
-    (BLACK, ":"),
-)  # colours and lines of joints in their order
+    (BLUE, "-"), (VERMILION, (0, (4, 1))), (GREEN, "-."), (ORANGE, (0, (6, 1, 1, 1))), (PURPLE, (0, (2, 1))),
+    (SKY, "-"), (BLACK, ":"),
+)  # fmt: skip  # colours and lines of joints in their order
 DASHED = (0, (3.5, 1.5))  # of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 _OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)

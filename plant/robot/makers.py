@@ -63,39 +63,7 @@ class UniversalRobot:
         return arm_from_dh(a, (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6), ur5.DH_ALPHA, NO_BALL, ur5.JOINT_NAMES)
 
 
-_CENTRES_3 = (
-    (0.0, -0.02, 0.0), (0.13, 0.0, 0.1157), (0.05, 0.0, 0.0238), (0.0, 0.0, 0.01), (0.0, 0.0, 0.01), (0.0, 0.0, -0.02),
-)  # fmt: skip
-_CENTRES_10 = (
-    (0.021, 0.0, 0.027), (0.38, 0.0, 0.158), (0.24, 0.0, 0.068), (0.0, 0.007, 0.018), (0.0, 0.007, 0.018),
-    (0.0, 0.0, -0.026),
-)  # fmt: skip
-UNIVERSAL_ROBOTS: Final = {
-    "UR3": UniversalRobot(
-        0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, (2.0, 3.42, 1.26, 0.8, 0.8, 0.35), _CENTRES_3,
-        (56.0, 28.0, 12.0), (180.0, 180.0, 360.0), 3.0,
-    ),
-    "UR5": UniversalRobot(
-        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, ur5.MASS, ur5.CENTRE_OF_MASS,
-        (150.0, 150.0, 28.0), (180.0, 180.0, 180.0), 5.0,
-    ),
-    "UR10": UniversalRobot(
-        0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, (7.1, 12.7, 4.27, 2.0, 2.0, 0.365), _CENTRES_10,
-        (330.0, 150.0, 56.0), (120.0, 180.0, 180.0), 10.0,
-    ),
-    "UR3e": UniversalRobot(
-        0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261), _CENTRES_3,
-        (56.0, 28.0, 12.0), (180.0, 180.0, 360.0), 3.0,
-    ),
-    "UR5e": UniversalRobot(
-        0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, (3.761, 8.058, 2.846, 1.37, 1.3, 0.365), ur5.CENTRE_OF_MASS,
-        (150.0, 150.0, 28.0), (180.0, 180.0, 180.0), 5.0,
-    ),
-    "UR10e": UniversalRobot(
-        0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, (7.369, 13.051, 3.989, 2.1, 1.98, 0.615), _CENTRES_10,
-        (330.0, 150.0, 56.0), (120.0, 180.0, 180.0), 12.5,
-    ),
-}  # fmt: skip
+UNIVERSAL_ROBOTS: Final = {title: UniversalRobot(**row) for title, row in ur5.ARMS["universal_robots"].items()}
 
 
 @cache
@@ -145,43 +113,16 @@ def _ur_limits(row: UniversalRobot) -> JointLimits:
     return JointLimits(np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(_by_joint(row.speed)))
 
 
-# Modified DH: the translation and rotation that lead to joint i, and then from joint 7 to the flange.
-_PANDA_A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088, 0.0)
-_PANDA_D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0, 0.107)
-_PANDA_ALPHA = (0.0, -pi / 2, pi / 2, pi / 2, -pi / 2, pi / 2, pi / 2, 0.0)
-_PANDA_MASS = (4.970684, 0.646926, 3.228604, 3.587895, 1.225946, 1.666555, 0.735522)
-_PANDA_CENTRE = (
-    (3.875e-3, 2.081e-3, -0.04762), (-3.141e-3, -2.872e-2, 3.495e-3), (2.7518e-2, 3.9252e-2, -6.6502e-2),
-    (-5.317e-2, 1.04419e-1, 2.7454e-2), (-1.1953e-2, 4.1065e-2, -3.8437e-2), (6.0149e-2, -1.4117e-2, -1.0517e-2),
-    (1.0517e-2, -4.252e-3, 6.1597e-2),
-)  # fmt: skip
-# ixx, ixy, ixz, iyy, iyz, izz about the centre of mass [kg m²].
-_PANDA_INERTIA = (
-    (7.0337e-1, -1.39e-4, 6.772e-3, 7.0661e-1, 1.9169e-2, 9.117e-3),
-    (7.962e-3, -3.925e-3, 1.0254e-2, 2.811e-2, 7.04e-4, 2.5995e-2),
-    (3.7242e-2, -4.761e-3, -1.1396e-2, 3.6155e-2, -1.2805e-2, 1.083e-2),
-    (2.5853e-2, 7.796e-3, -1.332e-3, 1.9552e-2, 8.641e-3, 2.8323e-2),
-    (3.5549e-2, -2.117e-3, -4.037e-3, 2.9474e-2, 2.29e-4, 8.627e-3),
-    (1.964e-3, 1.09e-4, -1.158e-3, 4.354e-3, 3.41e-4, 5.433e-3),
-    (1.2516e-2, -4.28e-4, -1.196e-3, 1.0027e-2, -7.41e-4, 4.815e-3),
-)
-_PANDA_RADIUS = (0.06, 0.06, 0.06, 0.06, 0.055, 0.05, 0.045)  # [m]
-
-
 @cache
 def panda() -> Robot:
     """Return Franka's Panda, the arm with seven joints."""
-    joints = tuple(f"joint_{i}" for i in range(1, 8))
-    arm = with_ball(arm_from_modified_dh(_PANDA_A, _PANDA_D, _PANDA_ALPHA, joints))
-    limits = JointLimits(
-        np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]),
-        np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]),
-        np.array([2.175] * 4 + [2.61] * 3),
-    )
-    inertia = np.array([[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in _PANDA_INERTIA])
-    radius, aside = np.array(_PANDA_RADIUS), np.zeros(7)
-    bodies = at_far_end(arm, np.array(_PANDA_CENTRE), inertia)
-    links = Links(np.array(_PANDA_MASS), *bodies, np.array([87.0] * 4 + [12.0] * 3), radius, aside, 3.0)
+    facts, joints = ur5.ARMS["panda"], tuple(f"joint_{i}" for i in range(1, 8))
+    arm = with_ball(arm_from_modified_dh(facts["a"], facts["d"], facts["alpha"], joints))
+    limits = JointLimits(*(np.array(facts[name]) for name in ("lower", "upper", "speed")))
+    inertia = np.array([[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]])
+    radius, aside = np.array(facts["radius"]), np.zeros(7)
+    bodies = at_far_end(arm, np.array(facts["centre"]), inertia)
+    links = Links(np.array(facts["mass"]), *bodies, np.array(facts["torque"]), radius, aside, 3.0)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
 

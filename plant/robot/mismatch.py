@@ -319,32 +319,21 @@ AXES = {
 RANGES = {
     "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "px": "0:20:5px", "ms": "0:200:50ms", "": "1:2:0.5",
 }  # fmt: skip
-PROFILES: dict[str, dict[str, float]] = {
+
+
+def _profile(share: float, zeros: float, turn: float, tool: float, centre: float) -> dict[str, float]:
+    """Return the magnitudes of a profile; zeros (and mount) and turn in deg, tool in m, centre in px."""
+    angles = {"joint_offsets": radians(zeros), "camera_rotation": radians(turn)}
+    cameras = {"focal": share, "centre": centre, "distortion": share, "mount": radians(zeros)}
+    return {"links": share, **angles, "tool": tool, **cameras}
+
+
+PROFILES: Final[dict[str, dict[str, float]]] = {
     "none": {},
     "factory": {},
-    "moderate": {
-        "links": 0.05,
-        "joint_offsets": radians(3.0),
-        "camera_rotation": radians(15.0),
-        "tool": 0.02,
-        "focal": 0.05,
-        "centre": 5.0,
-        "distortion": 0.05,
-        "mount": radians(3.0),
-    },
-    "severe": {
-        "links": 0.1,
-        "joint_offsets": radians(6.0),
-        "camera_rotation": radians(45.0),
-        "tool": 0.04,
-        "focal": 0.1,
-        "centre": 10.0,
-        "distortion": 0.1,
-        "mount": radians(6.0),
-    },
+    "moderate": _profile(0.05, 3.0, 15.0, 0.02, 5.0),
+    "severe": _profile(0.1, 6.0, 45.0, 0.04, 10.0),
 }
-
-
 USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
 
 
