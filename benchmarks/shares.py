@@ -123,10 +123,7 @@ def main() -> None:
     for owner, names, part in SHARED:
         for name in names:
             clock.wrap(owner, name, part)
-    sides = {
-        "single runs": measure(clock, runs, together=False),
-        "side by side": measure(clock, block, together=True),
-    }
+    sides = {"single runs": measure(clock, runs, together=False), "side by side": measure(clock, block, together=True)}
     rows = [
         [side, f"`{method}`", *(f"{value:.1f}" for value in (*parts.values(), sum(parts.values())))]
         for side, costs in sides.items()

@@ -122,10 +122,7 @@ def sampled_sections(layout: Layout) -> tuple[Section, ...]:
     """Return outputs and initial unknowns of a system in discrete time: every output depends on every input."""
     inputs = tuple(group.name for group in layout.of_role(INPUT))
     rows: _Rows = [(group.name, inputs, False) for group in layout.of_role(SAMPLED)]
-    return (
-        _section(layout, "Outputs", "Output", rows),
-        _section(layout, "InitialUnknowns", "InitialUnknown", rows),
-    )
+    return (_section(layout, "Outputs", "Output", rows), _section(layout, "InitialUnknowns", "InitialUnknown", rows))
 
 
 def _section(layout: Layout, fmi2: str, fmi3: str, rows: _Rows) -> Section:

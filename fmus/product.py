@@ -35,10 +35,7 @@ HEADERS: Final = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
-FMI_SOURCES: Final = {
-    2: ("fmi2.c",),
-    3: ("fmi3.c", "fmi3_derivatives.c", "fmi3_absent.c"),
-}
+FMI_SOURCES: Final = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_derivatives.c", "fmi3_absent.c")}
 INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
 SHARED_SOURCES: Final = ("model.c", "instance.c")
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold

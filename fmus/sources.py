@@ -53,11 +53,7 @@ def generated_source(name: str, functions: Iterable[Any]) -> str:
 
 
 def layout_header(
-    layout: Layout,
-    start: Mapping[str, FloatArray],
-    constants: Mapping[str, float],
-    model_name: str,
-    token: str,
+    layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], model_name: str, token: str
 ) -> str:
     """Return the C header with sizes, offsets, start values and minima.
 

@@ -212,12 +212,7 @@ class Regression:
         return state._replace(bank=interrupted(state.bank, frame), mean=mean, share=np.zeros_like(state.share))
 
     def update(
-        self,
-        state: RegressionState,
-        h: FloatArray,
-        feature_step: FloatArray,
-        duration: FloatArray,
-        frame: FloatArray,
+        self, state: RegressionState, h: FloatArray, feature_step: FloatArray, duration: FloatArray, frame: FloatArray
     ) -> RegressionState:
         """Return the state after a motion.
 

@@ -55,11 +55,7 @@ def settled_at_places(runs: pd.DataFrame) -> list[str]:
 
 
 MAP = Study(
-    "robustness",
-    "the robustness map: its two pictures",
-    2,
-    {"map": mapping("fmu", "50000:50030")},
-    files=map_pictures,
+    "robustness", "the robustness map: its two pictures", 2, {"map": mapping("fmu", "50000:50030")}, files=map_pictures
 )
 MAP_ENGINES = Study(
     "robustness_engines",

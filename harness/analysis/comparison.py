@@ -204,11 +204,7 @@ def knows_truth(name: str) -> bool:
 
 
 def compare_pairs(
-    runs: pd.DataFrame,
-    pairs: Sequence[tuple[str, str]],
-    *,
-    metric: str = "settling_time_s",
-    keys: Sequence[str] = KEYS,
+    runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], *, metric: str = "settling_time_s", keys: Sequence[str] = KEYS
 ) -> list[Difference]:
     """Compare controllers on the runs of one place that they share.
 

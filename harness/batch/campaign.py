@@ -249,12 +249,7 @@ class _Jobs:
 
 
 def _carry_out_missing(
-    campaign: Campaign,
-    jobs: _Jobs,
-    own: tuple[Offer, ...],
-    folder: Path,
-    place: Workers,
-    how: Execution,
+    campaign: Campaign, jobs: _Jobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out the runs whose part is not in the folder; yield each block with its results."""
     total = len(campaign.cells)

@@ -188,10 +188,7 @@ def tune(
     ] = "all",
     studies: Annotated[
         int,
-        option(
-            "COUNT",
-            "Studies of each method; their results and the values in use meet on a second set of robots.",
-        ),
+        option("COUNT", "Studies of each method; their results and the values in use meet on a second set of robots."),
     ] = 3,
     trials: Annotated[int, option("COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[

@@ -252,10 +252,7 @@ def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
 
 
 def draw_places(
-    axes: Axes,
-    places: Sequence[float],
-    values: Mapping[str, Sequence[Estimate]],
-    styles: Mapping[str, MethodStyle],
+    axes: Axes, places: Sequence[float], values: Mapping[str, Sequence[Estimate]], styles: Mapping[str, MethodStyle]
 ) -> None:
     """Draw an estimate with its interval for each method at each place (abscissae, ascending), marks shifted sideways.
 

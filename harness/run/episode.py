@@ -36,12 +36,7 @@ def run_experiment(request: RunRequest, settings: Settings, *, steps: bool = Tru
 
 
 def carry_out(
-    resolved: ResolvedRun,
-    *,
-    steps: bool = True,
-    picture: bool = False,
-    keep: Path | None = None,
-    debug: bool = False,
+    resolved: ResolvedRun, *, steps: bool = True, picture: bool = False, keep: Path | None = None, debug: bool = False
 ) -> RunResult:
     """Carry one run out; the row's `status` and `reason` name a fault on the way.
 

@@ -222,10 +222,7 @@ def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
 
 
 def _assemble(
-    resolved: ResolvedRun,
-    true: RobotModel | None,
-    start: FloatArray | None,
-    progress: Progress | None = None,
+    resolved: ResolvedRun, true: RobotModel | None, start: FloatArray | None, progress: Progress | None = None
 ) -> tuple[Plant, Controller, Sequence[TrainedNetworks]]:
     """Return plant, controller and its networks for a true robot and a start (..., n) [rad].
 

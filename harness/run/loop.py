@@ -161,11 +161,7 @@ def run_loop(
 
 
 def begin(
-    plant: Plant,
-    controller: Controller,
-    desired: FloatArray,
-    settings: LoopSettings,
-    seeds: tuple[Any, Any],
+    plant: Plant, controller: Controller, desired: FloatArray, settings: LoopSettings, seeds: tuple[Any, Any]
 ) -> Rollout:
     """Reset plant and controller, each with its own of `seeds`, and return the run at its first instant."""
     rollout = Rollout(plant, plant.reset(seeds[0]), desired, settings)

@@ -47,11 +47,7 @@ DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
 
 
 def carry_out_suite(
-    out: Path,
-    challenges: Sequence[Challenge],
-    runs: Mapping[str, Sequence[Run]],
-    settings: Settings,
-    how: Execution,
+    out: Path, challenges: Sequence[Challenge], runs: Mapping[str, Sequence[Run]], settings: Settings, how: Execution
 ) -> pd.DataFrame:
     """Carry out the runs of challenges, judge them, write tables and pictures, and return the judged runs.
 

@@ -131,14 +131,7 @@ def position_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> F
     return motions[..., 0, 0, :, :]
 
 
-in_pixels = partial(
-    SensingSetup,
-    unit="px",
-    measure=pixels,
-    rates=pixel_rates,
-    scale=pixels_per_metre,
-    single=True,
-)
+in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, scale=pixels_per_metre, single=True)
 """Make a set-up of points in images, the features of which are `pixels`."""
 
 HALF: Final = 0.12  # [m] half side of the plate's square, at the corners of which the discs are

@@ -30,11 +30,7 @@ class FmuModel:
     """
 
     def __init__(
-        self,
-        path: Path,
-        joints: Sequence[str],
-        features: Sequence[str],
-        parameters: Mapping[str, float],
+        self, path: Path, joints: Sequence[str], features: Sequence[str], parameters: Mapping[str, float]
     ) -> None:
         """Load the FMU.
 

@@ -147,11 +147,7 @@ class SerialArm:
 
 
 def arm_from_dh(
-    a: npt.ArrayLike,
-    d: npt.ArrayLike,
-    alpha: npt.ArrayLike,
-    tool: npt.ArrayLike,
-    joint_names: tuple[str, ...],
+    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, tool: npt.ArrayLike, joint_names: tuple[str, ...]
 ) -> SerialArm:
     """Return the arm of a standard DH table.
 

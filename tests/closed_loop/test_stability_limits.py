@@ -16,8 +16,7 @@ NO_POSTURE = {"aids": {"posture": False}}
 
 
 @pytest.mark.parametrize(
-    ("controller", "settings"),
-    [*((name, {}) for name in PUBLISHED), ("regression_mfac", NO_POSTURE)],
+    ("controller", "settings"), [*((name, {}) for name in PUBLISHED), ("regression_mfac", NO_POSTURE)]
 )
 def test_predicted_limits_are_those_of_small_motions(controller, settings):
     run = resolve(RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings}))

@@ -66,11 +66,7 @@ class Falls(Mine):
         ctypes.string_at(0)
 """
 ).replace("import numpy", "import ctypes\nimport os\n\nimport numpy")
-MODULES = {
-    "crash": "1 / 0\n",
-    "end": "import os\n\nos._exit(0)\n",
-    "wait": "import time\n\ntime.sleep(1000)\n",
-}
+MODULES = {"crash": "1 / 0\n", "end": "import os\n\nos._exit(0)\n", "wait": "import time\n\ntime.sleep(1000)\n"}
 CELLS = (
     CELL
     + """

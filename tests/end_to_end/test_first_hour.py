@@ -27,14 +27,7 @@ from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
 ORDER = re.findall(r"^(?:.*<)?(\w+)>?$", "".join(blocks(read("index.md"), "{toctree}")), re.MULTILINE)
 SESSIONS = [page.stem for page in DOCS if "```console\n" in page.read_text(encoding="utf-8")]
-HOUR = (
-    "five_minutes",
-    "own_controller",
-    "own_robot",
-    "own_sensing",
-    "fmu",
-    "learning",
-)
+HOUR = ("five_minutes", "own_controller", "own_robot", "own_sensing", "fmu", "learning")
 SITE = sorted({*SESSIONS, *HOUR}, key=ORDER.index)
 LEFT_OUT = {  # words of a block -> why it is not carried out
     "--platforms all": "needs the compilers of the extra cross",

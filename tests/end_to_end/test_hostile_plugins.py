@@ -78,12 +78,7 @@ def plugin(tmp_path) -> Path:
 
 @pytest.mark.parametrize(
     ("command", "how", "workers"),
-    [
-        ("compare", "exit", "1"),
-        ("sweep", "build", "2"),
-        ("sweep", "close", "1"),
-        ("tune", "hang", "2"),
-    ],
+    [("compare", "exit", "1"), ("sweep", "build", "2"), ("sweep", "close", "1"), ("tune", "hang", "2")],
 )
 def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
     out = tmp_path / "out"

@@ -8,13 +8,7 @@ import pytest
 
 from kit.straight_move import CONDITION, SPEC, VELOCITY, straight_move
 from servobench.harness.run.log import StepLog, column_unit
-from servobench.harness.run.metrics import (
-    judge_run,
-    overshoot,
-    path_length,
-    settling_time,
-    sign_switches,
-)
+from servobench.harness.run.metrics import judge_run, overshoot, path_length, settling_time, sign_switches
 
 PERIOD = 0.1
 

@@ -40,10 +40,7 @@ def test_depths_share_their_error_over_a_patch_and_not_beyond(side):
     deviation = side * CAMERA.width / 848 / np.sqrt(12)
     for distance in (1, 2, 12):
         expected = np.exp(-(distance**2) / (4 * deviation**2)) if side else 0.0
-        for one, other in (
-            (image[distance:], image[:-distance]),
-            (image[:, distance:], image[:, :-distance]),
-        ):
+        for one, other in ((image[distance:], image[:-distance]), (image[:, distance:], image[:, :-distance])):
             assert np.mean(one * other) / np.mean(image**2) == pytest.approx(expected, abs=0.06)
 
 

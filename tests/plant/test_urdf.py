@@ -38,11 +38,7 @@ def perturbed_ur5() -> SerialArm:
     )
 
 
-ARMS = {
-    "nominal": ur5.ur5_arm,
-    "factory": factory_ur5,
-    "perturbed": perturbed_ur5,
-}
+ARMS = {"nominal": ur5.ur5_arm, "factory": factory_ur5, "perturbed": perturbed_ur5}
 
 
 @pytest.fixture(params=ARMS)

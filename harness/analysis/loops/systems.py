@@ -91,10 +91,7 @@ def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) ->
     B, D = controller.B, controller.D
     by_plant, by_law = D[:, :measured] @ plant.C, controller.C
     A = np.block(
-        [
-            [plant.A + gain * plant.B @ by_plant, gain * plant.B @ by_law],
-            [B[:, :measured] @ plant.C, controller.A],
-        ]
+        [[plant.A + gain * plant.B @ by_plant, gain * plant.B @ by_law], [B[:, :measured] @ plant.C, controller.A]]
     )
     references = np.vstack([gain * plant.B @ D[:, measured:], B[:, measured:]])
     C = np.hstack([plant.C, np.zeros((measured, len(controller.A)))])
