@@ -51,6 +51,14 @@ def folder(tmp_path):
     return made
 
 
+def test_a_metric_of_pairs_is_refused_where_there_is_one_controller():
+    alone = pd.DataFrame([made_up_row(f"run{seed}", seed=seed) for seed in range(2)])
+    with pytest.raises(ConfigurationError, match="by which pairs of controllers are compared; there is one"):
+        list(statistics_rows(alone, "settling_time_s"))
+    ((_, controllers, pairs),) = statistics_rows(alone)
+    assert (len(controllers), pairs) == (1, [])
+
+
 def test_parts_are_readable_before_and_after_they_are_put_together(folder):
     for index in (1, 0):
         add_part(folder, index)
