@@ -21,7 +21,6 @@ from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import remark
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
 HELP_NAMES: Final = ["-h", "--help"]
@@ -102,6 +101,8 @@ def in_known_number(root: Any, words: list[str]) -> list[str]:  # noqa: ANN401 -
         if option == "--seed" and at < len(words) and words[at].rpartition("=")[2].isdigit():
             words[at] += ","
         elif option == "--seeds":
+            from servobench.plant.contract.settings import remark
+
             remark(f"{name} has one seed, the number of --seed; compare and sweep take several")
     return words
 

@@ -96,7 +96,7 @@ def test_a_method_keeps_the_contract_of_controllers(entry):
         each for each in checked if each.verdict == "failed" and each.check != "time"
     ]  # which the machine decides
     assert not defects
-    assert len(checked) == 16
+    assert len(checked) == 18
 
 
 @pytest.mark.parametrize("entry", COMPOSED)

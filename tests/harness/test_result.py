@@ -12,6 +12,7 @@ import pytest
 
 import servobench
 from kit.command import judged
+from kit.folders import made_up_row
 from kit.resting import Resting
 from kit.toy_plants import Plain
 from servobench.controllers.controller import Controller, RobotKnowledge
@@ -170,7 +171,7 @@ def test_an_interrupted_batch_that_is_resumed_has_the_log_of_all_runs(tmp_path):
     folder, rows = tmp_path / "out", []
     results.create_folder(folder, {"run_count": 2})
     for i in range(2):
-        row = {"run_id": f"run{i}", "status": "crashed", "reason": f"no {i}"}
+        row = made_up_row(f"run{i}", seed=i, status="crashed", reason=f"no {i}")
         rows.append(log_entry(row, "a\nb"))
         results.write_part(folder, i, [RunResult(row, None, trace="a\nb")])
         results.collect(folder)

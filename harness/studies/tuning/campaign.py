@@ -136,8 +136,12 @@ class Method:
     def wanted_on_second(self) -> list[Wanted]:
         """Return the points to score on the second set, once all studies have ended: their results and known values."""
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
-        points = [*self._known, *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
+        points = [*self._scored(), *(each.settings for each in outcomes)] if len(outcomes) == len(self.studies) else []
         return [(self.second, self.name, point) for point in points]
+
+    def _scored(self) -> list[Mapping[str, Any]]:
+        """Return the defaults and the values in use, as far as they were scored: a study may have a single trial."""
+        return [each for each in self._known if self.ledger.costs(each) is not None]
 
     def result(self) -> TunedValues | None:
         """Return the tuned values; None while a study is not finished or not scored on the second set.
@@ -153,7 +157,7 @@ class Method:
         ]
         if len(records) < len(self.studies):
             return None
-        candidates = [*(each.settings for each in records), *self._known]
+        candidates = [*(each.settings for each in records), *self._scored()]
         costs = [self.second.costs(each) for each in candidates]
         mean = [math.inf if each is None else score(each) for each in costs]
         best, runs = candidates[mean.index(min(mean))], self._plan.runs
