@@ -160,7 +160,7 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
     plain_logarithms(axes, "x")
-    axes.set_xlabel("step of the controller [ms]")
+    axes.set_xlabel("step of the controller [ms]" if layout.wide else "step [ms]")
     axes.set_xlim(right=top)
     _name_rows(axes, list(known), layout)
     return figure
