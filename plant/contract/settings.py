@@ -245,8 +245,11 @@ def _suggest_setting(key: str, section: object) -> str:
     return suggest(key, known) if known else "it has none"
 
 
-def _with_tuples(value: object) -> object:
-    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
+def with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
+    """Return a value with tuples for lists, at any depth."""
+    if isinstance(value, dict):
+        return {key: with_tuples(each) for key, each in value.items()}
+    return tuple(map(with_tuples, value)) if isinstance(value, list) else value
 
 
 class Check(NamedTuple):
@@ -314,7 +317,7 @@ def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) 
     Raises:
         ValueError: another type, out of bounds, or in a unit that does not fit; in the unit in which it was written.
     """
-    written = _with_tuples(given)
+    written = with_tuples(given)
     try:
         value = check.type.validate_python(_in_own_unit(name, written, unit))
     except ValidationError as error:

@@ -4,28 +4,20 @@ Sources: Universal Robots, "DH parameters for calculations of kinematics and dyn
 and torques); inertia tensors by the cylinder approximation that the vendor's ROS description uses.
 """
 
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import with_tuples
 from servobench.plant.robot.arm import SerialArm, arm_from_dh
 
 DATA: Final = Path(str(files("servobench.plant") / "data"))
-
-
-def _with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
-    """Return the value with tuples for lists."""
-    if isinstance(value, dict):
-        return {key: _with_tuples(each) for key, each in value.items()}
-    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
-
-
 UR5 = "ur5"  # name of the robot in the catalogue
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
-ARMS: Final[Mapping[str, Any]] = _with_tuples(tomllib.loads((DATA / "arms.toml").read_text(encoding="utf-8")))
+ARMS: Final[Mapping[str, Any]] = with_tuples(read_toml("facts of arms", DATA / "arms.toml"))
 """Facts by arm, with units and sources in the file."""
 _FACTS = ARMS["ur5"]
 DH_A, DH_D, DH_ALPHA = _FACTS["a"], _FACTS["d"], _FACTS["alpha"]
