@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import ImageReference, Reference
@@ -118,7 +119,5 @@ def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, Floa
     """
     middle, goal = points.mean(axis=-2), wanted.mean(axis=-2)
     correlation = (points - middle[..., None, :]).mT @ (wanted - goal[..., None, :])
-    left, _, right = np.linalg.svd(correlation)
-    left[..., -1] *= np.linalg.det(left @ right)[..., None]
-    rotation = Rotation.from_matrix((left @ right).reshape(-1, 3, 3))
+    rotation = Rotation.from_matrix(nearest_rotation(correlation).reshape(-1, 3, 3))
     return norm(middle - goal), rotation.magnitude().reshape(middle.shape[:-1])

@@ -10,6 +10,7 @@ from typing import Final, final
 import numpy as np
 import pandas as pd
 
+from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import COMMAND, StepLog, column_names
@@ -23,11 +24,11 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 from servobench.plant.robot.hand_eye import RobotModel
 
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
-FREE: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
-FAR: Final = 20.0  # [m] beyond which no feature is, in natural units
-SHORT: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
-LATE: Final = 12  # control periods by which features may be late
-ALIKE: Final = 0.35  # share of the motion by which features may differ without a remark
+MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
+MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
+MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
+MAX_LATE: Final = 12  # control periods by which features may be late
+MAX_SHARE_APART: Final = 0.35  # share of the motion by which features may differ without a remark
 TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
 
@@ -85,22 +86,22 @@ class LoggedPlant(Plant):
         )
         if beyond.max() > math.pi:
             raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
-        if beyond.max() > FREE:
+        if beyond.max() > MAX_EXCESS:
             remark(where)
         sizes, unit = np.abs(self._features).max(axis=1), spec.feature.unit
         far, size = int(sizes.argmax()), float(sizes.max())
-        if unit in ("m", "px") and size > FAR * spec.feature.scale:
+        if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
             meant = "; if the log is in mm, write it in m" if unit == "m" else ""
             raise ConfigurationError(f"row {far} of the log has a feature of {size:g} {unit}, beyond any camera{meant}")
-        if model is not None and self._valid[LATE:].any():
+        if model is not None and self._valid[MAX_LATE:].any():
             self._check_motion(model)
 
     def _check_motion(self, model: RobotModel) -> None:
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
         y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self._joints)))
-        rows = len(y) - np.arange(min(LATE, len(y) // 2))
+        rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
         apart = min(_apart(y[-k:][self._valid[-k:]], p[:k][self._valid[-k:]], self.spec.feature.unit) for k in rows)
-        if apart > ALIKE:
+        if apart > MAX_SHARE_APART:
             remark(
                 f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}: look for other "
                 "units, another order or sign of joints, another arm, or a camera that was moved"
@@ -175,14 +176,13 @@ def _apart(y: FloatArray, p: FloatArray, unit: str) -> float:
     """Return the share of the motion of features (k, m) that no image of the others explains; 0 for short motions."""
     y, p = y - y.mean(axis=0), p - p.mean(axis=0)
     seen, made = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (y, p))
-    if max(seen, made) < SHORT:
+    if max(seen, made) < MIN_MOTION:
         return 0.0
-    if unit == "m":
-        left, wide, right = np.linalg.svd(y.T @ p / len(p))  # the best turn of one path onto the other, by Kabsch
-        wide[-1] *= np.sign(np.linalg.det(left @ right))
-        return math.sqrt(max(seen**2 + made**2 - 2.0 * float(wide.sum()), 0.0)) / max(seen, made)
-    rest = np.linalg.norm(y - p @ np.linalg.lstsq(p, y, rcond=None)[0])
-    return 1.0 if 8.0 * seen < made else float(rest / np.linalg.norm(y))
+    image = nearest_rotation(y.T @ p).T if unit == "m" else np.linalg.lstsq(p, y, rcond=None)[0]
+    if unit != "m" and 8.0 * seen < made:
+        return 1.0
+    rest = float(np.sqrt(np.mean(np.sum((y - p @ image) ** 2, axis=1))))
+    return rest / (max(seen, made) if unit == "m" else seen)
 
 
 def has_commands(steps: pd.DataFrame) -> bool:
