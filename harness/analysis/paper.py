@@ -29,7 +29,7 @@ SIGNS: Final = str.maketrans(
 INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
 NUMBER: Final = re.compile(r"[-+\d∞–]")
 MINUS: Final = re.compile(r"(?<![\w.])-(?=\d)")
-NARROW: Final = 50  # letters of all columns of a table that fits one column of a paper, at most
+ONE_COLUMN: Final = 50  # letters of all columns of a table that fits one column of a paper, at most
 HEADING: Final = 12  # letters of a line of a heading
 MAIN_PACKAGES: Final = ("numpy", "scipy")
 BIBTEX: Final = r"""\begin{filecontents*}[overwrite]{servobench.bib}
@@ -53,7 +53,7 @@ def latex_tables(tables: Tables) -> Iterator[str]:
 def _table(title: str, rows: pd.DataFrame) -> str:
     """Return a table of text for the package booktabs, over both columns of a paper if it is wide."""
     letters = sum(rows[name].str.len().max() for name in rows)
-    kind = "table" if letters <= NARROW else "table*"
+    kind = "table" if letters <= ONE_COLUMN else "table*"
     sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
     body = [" & ".join(map(_cell, row)) for row in rows.itertuples(index=False)]
     lines = [

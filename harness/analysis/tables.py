@@ -338,12 +338,12 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return for each move how many runs settled, how fast, and with what error."""
+    """Return for each move the share of runs that settled, their settling times and errors."""
     return _by_task(split_tasks(in_handy_units(runs))[0], "moves")
 
 
 def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return for each curve how many runs followed it, and with what error."""
+    """Return for each curve the share of runs that followed it, and their errors."""
     return _by_task(split_tasks(in_handy_units(runs))[1], "curves")
 
 

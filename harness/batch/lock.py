@@ -230,7 +230,7 @@ def refuse_links(folder: Path) -> None:
 
 
 def is_unused(folder: Path) -> bool:
-    """Return whether a folder is missing, empty, or holds only what a batch leaves that ends before its first run."""
+    """Return whether a folder is missing, empty, or of a batch that ended before its first run."""
     if not folder.is_dir():
         return not folder.exists()
     try:

@@ -161,7 +161,7 @@ def collect(folder: Path) -> int:
         ConfigurationError: there are no parts and no tables, or a file is damaged.
         UnwritableFolder: the folder takes no more files.
     """
-    load_runs(folder)  # refuses what is not of runs
+    load_runs(folder)  # refuses a table of anything else
     return put_together(folder, read_manifest(folder))
 
 

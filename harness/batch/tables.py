@@ -20,7 +20,7 @@ from servobench.plant.contract.faults import ConfigurationError
 
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
-MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table, whatever its size, and by the size of its file
+MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table of any size, and for each byte of its file
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
@@ -214,8 +214,9 @@ TEXTS: Final = frozenset(
     ("run_id", "plant", "controller", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit",
      "status", "outcome", "reason", "mismatch_values", "part")
 )  # fmt: skip
-SHORT: Final = (short.column for short in SHORT_NAMES.values())
-NUMBERS: Final = frozenset({"seed", "periods", "settling_band", *METRICS, *SHORT})
+NUMBERS: Final = frozenset(
+    {"seed", "periods", "settling_band", *METRICS, *(short.column for short in SHORT_NAMES.values())}
+)
 RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
 

@@ -150,7 +150,7 @@ def _shares(rows: pd.DataFrame, least: dict[str, int], whole: dict[str, int], ro
 
 
 def end_interrupted(kept: str, going_on: str) -> NoReturn:
-    """End the command after Ctrl-C with a line that says what is kept and which call goes on."""
+    """End the command after Ctrl-C with a line: the results that are kept, and the call that goes on."""
     sys.stderr.write(f"servobench: interrupted: {kept}; {going_on}\n")
     raise SystemExit(INTERRUPTED)
 

@@ -113,7 +113,7 @@ class Registry(Generic[Entry]):
         """Return the name of an entry by which it is found from now on.
 
         Args:
-            given: a name, the place of a user's code such as ./mine.py:Mine, or what a user gave in Python.
+            given: a name, the place of a user's code such as ./mine.py:Mine, or an object that a user gave in Python.
 
         Raises:
             ConfigurationError: there is none, or it cannot be used; one line with file and line number.

@@ -57,7 +57,7 @@ KINDS: Final = {
     "tracking": Kind("Error along the curve, and in each feature", OVER),
     "tracking_path": Kind("Desired and true path, to scale", FIRST),
     "jacobian": Kind("Error of the estimated Jacobian", OVER),
-    "settling": Kind("When each run settled, and with what error it ended", EACH),
+    "settling": Kind("Settling time of each run, and its error at the end", EACH),
     "effort": Kind("Control effort and saturation of each run", EACH, in_page=False),
     "smoothness": Kind("How smoothly each run drives the joints", EACH),
     "step_times": Kind("Step of the controller", EACH),

@@ -64,7 +64,7 @@ QUANTITIES: Final = (
 )  # a column of panels each: its title, the metric written into it, and its form
 STACKED: Final = 1.5  # ratio of the heights of marks that stand above each other
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
-LATE_ROOM: Final = 1.3  # of an axis over the largest error after the approach
+AXIS_ROOM: Final = 1.3  # of an axis over the largest error after the approach
 NEAR: Final = 0.02  # of a time axis, within which marks stand above each other
 FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
 OUTSIDE: Final = 1e12  # of every picture
@@ -264,7 +264,7 @@ def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str
         reach = max(reach, float(np.max(late[np.isfinite(late)], initial=0.0)))
     if reach > 0.0:
         low, high = axes.get_ylim() if axes.get_autoscaley_on() is False else (0.0, 0.0)
-        reach = max(LATE_ROOM * reach, -low, high)
+        reach = max(AXIS_ROOM * reach, -low, high)
         axes.set_ylim(-reach, reach)
     axes.set_ylabel(f"error in\n{name} [{unit}]")
 

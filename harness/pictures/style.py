@@ -47,7 +47,7 @@ UNDATED: Final[dict[str, Any]] = {
 }
 RESOLUTION = 150  # dpi of PNG
 PALETTE = 64  # colours
-STRIP = 0.04  # [in] above and below what is drawn
+STRIP = 0.04  # [in] above and below the drawing
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
 NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
@@ -299,7 +299,7 @@ def save_figure(
 ) -> list[Path]:
     """Write a figure in each format, by default PNG and PDF, under one name; the same figure gives the same bytes.
 
-    Its width is that of the figure; with `exact_width` its height is that of what is drawn, without empty strips.
+    Its width is that of the figure; with `exact_width` its height is that of the drawing, without empty strips.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths, box = [], None
@@ -321,9 +321,9 @@ def save_figure(
 
 
 def box_of(figure: Figure) -> Bbox:
-    """Lay a figure out for good; return the box [in] as high as what is drawn and as wide as the figure."""
+    """Lay a figure out for good; return the box [in] as high as the drawing and as wide as the figure."""
     if (engine := figure.get_layout_engine()) is not None:
-        engine.execute(figure)  # once, also for the edges of what is drawn
+        engine.execute(figure)  # once, also for the edges of the drawing
         figure.set_layout_engine("none")
     drawn = figure.get_tightbbox()
     low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
@@ -333,7 +333,7 @@ def box_of(figure: Figure) -> Bbox:
 def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
     """Return a figure as a small, sharp PNG, and width and height with which it is to be shown, px.
 
-    The picture is as high as what is drawn: nothing is cut, and there is no empty strip.
+    The picture is as high as the drawing: nothing is cut, and there is no empty strip.
     """
     large, small = io.BytesIO(), io.BytesIO()
     with figure_style(TEXT):

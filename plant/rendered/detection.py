@@ -119,7 +119,7 @@ def add_colour_noise(
     """Return an image with white noise on each channel around all of a colour; nothing is drawn elsewhere.
 
     Noise gives pixels of other things this colour by chance, but never as many together as the mark's, so only the box
-    around what has it without noise matters.
+    around the pixels that have it without noise matters.
 
     Args:
         rgb: (h, w, 3 or 4).

@@ -1,7 +1,7 @@
 """A user's camera and target from a file: image, intrinsics, place, timing and noise; an example is in own_robot.md.
 
 The file is a TOML with the keys of `CameraFile`, or the intrinsics alone: a `camera_info` of ROS or a file of OpenCV's
-`FileStorage`, which a TOML may also name as its `intrinsics`. What it leaves out is as the bench has it.
+`FileStorage`, which a TOML may also name as its `intrinsics`. Keys that it lacks are as on the bench.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RANGES: Final = {  # of numbers: unit, least and largest
     "rate": ("Hz", 0.5, 1000), "latency": ("s", 0, 5),
 }  # fmt: skip
 FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
-FAR: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
+MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in files of ROS and OpenCV
     "width": ("image_width", "width"),
@@ -53,7 +53,7 @@ class Place:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        most = FAR.get(self.frame, math.inf)
+        most = MAX_PLACE.get(self.frame, math.inf)
         if bool(self.frame) != bool(self.position) or len(self.position) not in (0, 3):
             raise ValueError('a place needs frame, "base" or "flange", and position, three numbers in m')
         if max(map(abs, self.position), default=0.0) > most:
@@ -158,7 +158,7 @@ class OwnCamera:
     def pinhole(self) -> PinholeCamera:
         """An ideal camera with its size and horizontal focal length."""
         fov = 2.0 * math.degrees(math.atan(0.5 * self.keys.height / float(self.matrix[0, 0])))
-        return PinholeCamera(self.keys.width, self.keys.height, fov, far=2.0 * FAR["base"])
+        return PinholeCamera(self.keys.width, self.keys.height, fov, far=2.0 * MAX_PLACE["base"])
 
     def sensing(self, usual: SensingConfig, period: float) -> SensingConfig:
         """Return the settings of a sensor with this camera's timing and noise.
