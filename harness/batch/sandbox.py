@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -44,6 +44,7 @@ LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
+START_ERROR: Final = 1  # exit code of a guard that an error has kept from starting
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
@@ -229,11 +230,13 @@ class Sandbox:
                 return Ending(CRASHED, STOPPED)
         return None
 
-    def _start(self) -> Connection:
-        """Return the link to a guard that runs."""
+    def _start(self, *, again: bool = True) -> Connection:
+        """Return the link to a guard that runs; one that is ended while it starts is started once `again`."""
         if self._link is not None:
             return self._link
         context = get_context("fork") if self._copied else get_context("spawn")
+        if not self._copied:
+            resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
         ours, theirs = context.Pipe()
         inherited = (ours,) if self._copied else ()
         process: BaseProcess = context.Process(
@@ -247,21 +250,31 @@ class Sandbox:
                 process.start()
             self._process = process
         theirs.close()
-        if fault := _start_fault(ours):
+        if fault := _start_fault(ours, process):
+            ended = process.exitcode  # before the next line ends it
             ours.close()
             self.end(0.0)
+            if again and ended not in (None, START_ERROR):
+                return self._start(again=False)
             raise ConfigurationError(fault)
         self._link = ours
         return ours
 
 
-def _start_fault(link: Connection) -> str:
+def _start_fault(link: Connection, process: BaseProcess) -> str:
     """Wait until a guard has started and return why it has not; empty if it has."""
+    deadline = time.monotonic() + GUARD_START
     with contextlib.suppress(EOFError, OSError):
-        if not link.poll(GUARD_START):
-            return f"a worker process has not started within {GUARD_START:g} s"
+        while not link.poll(LOOK_EVERY):
+            if time.monotonic() > deadline:
+                return f"a worker process has not started within {GUARD_START:g} s"
+            if process.pid and processes.is_stopped(process.pid):
+                processes.send([process.pid], signal.SIGCONT)
         if link.recv_bytes() == ALIVE:
             return ""
+    process.join(STOP_TIME)
+    if process.exitcode not in (None, START_ERROR):
+        return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
     return (
         "the worker processes cannot be started; a script that starts some must keep its calls below "
         "`if __name__ == '__main__':`"
@@ -293,7 +306,7 @@ def _keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inheri
     processes.lead_session()
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     for name in modules:
         with contextlib.suppress(Exception):
             import_module(name)

@@ -1,9 +1,10 @@
-"""Sandboxes: calls with their answers, guards that do not start, and guards that are stopped."""
+"""Sandboxes: calls with their answers, guards that do not start or are ended meanwhile, and guards that are stopped."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -33,6 +34,66 @@ def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_woul
     finally:
         workers.stop()
     assert set(multiprocessing.active_children()) == before
+
+
+ONCE = """
+import os, pathlib, signal
+
+first = pathlib.Path(__file__).with_name("first")
+if not first.exists() or {always}:
+    first.touch()
+    os.kill(os.getpid(), signal.{name})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"])
+def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(name, tmp_path, monkeypatch):
+    (tmp_path / "ends_once.py").write_text(ONCE.format(name=name, always=False))
+    monkeypatch.syspath_prepend(tmp_path)
+    workers = Pool(1, Limits(), ("ends_once",))
+    try:
+        assert workers.submit(Task(harm, pickle.dumps("return"))).result(300.0).items == [["begins", "return"]]
+    finally:
+        workers.stop()
+
+
+@pytest.mark.slow
+def test_of_a_guard_that_is_ended_whenever_it_starts_the_signal_is_named(tmp_path, monkeypatch):
+    (tmp_path / "ends_always.py").write_text(ONCE.format(name="SIGKILL", always=True))
+    monkeypatch.syspath_prepend(tmp_path)
+    workers = Pool(1, Limits(), ("ends_always",))
+    try:
+        with pytest.raises(ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"):
+            workers.submit(Task(harm, pickle.dumps("return"))).result(300.0)
+    finally:
+        workers.stop()
+
+
+UNTOUCHED = """
+import os, pickle, signal
+from servobench.harness.batch.processes import Limits
+from servobench.harness.batch.sandbox import Pool, Task
+
+def blocked(_, tell):
+    tell([int(line.split()[1], 16) for line in open(f"/proc/{os.getppid()}/status") if line.startswith("SigBlk")])
+
+if __name__ == "__main__":
+    pool = Pool(1, Limits(), ())
+    ((mask,),) = pool.submit(Task(blocked, pickle.dumps(None))).result(300.0).items
+    pool.stop()
+    print(bool(mask & 1 << signal.SIGINT - 1))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the signals that a process blocks are read from /proc")
+def test_ctrl_c_does_not_reach_the_first_guard_while_it_starts(tmp_path):
+    (tmp_path / "starts.py").write_text(UNTOUCHED)
+    path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
+    done = subprocess.run([sys.executable, str(tmp_path / "starts.py")], capture_output=True, text=True, env=path,
+                          check=False, timeout=120)  # fmt: skip
+    assert done.stdout == "True\n", done.stderr
 
 
 STOPPED = """
