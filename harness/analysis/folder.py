@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
-from pyarrow import ArrowException
 
 from servobench.controllers.aids import describe_aids
 from servobench.harness.batch import results
+from servobench.harness.batch.tables import DamagedFile, read_tables
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
@@ -91,9 +91,9 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         if own or path.suffix not in (".parquet", ".csv"):
             continue
         try:
-            table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
-        except (OSError, ValueError, ArrowException, OverflowError) as error:
-            why = " ".join(str(error).split())
+            table = pd.read_csv(path) if path.suffix == ".csv" else read_tables(folder, [path.name])
+        except (OSError, ValueError, OverflowError) as error:
+            why = error.fault if isinstance(error, DamagedFile) else " ".join(str(error).split())
             raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
         yield path.stem, table
 
@@ -113,6 +113,6 @@ def _listed(values: list[Any]) -> str:
 
 def _seeds(seeds: list[int]) -> str:
     unique = sorted(set(seeds))
-    if len(unique) > 2 and unique == list(range(unique[0], unique[-1] + 1)):
+    if len(unique) > 2 and unique[-1] - unique[0] == len(unique) - 1:
         return f"{unique[0]} to {unique[-1]} ({len(unique)})"
     return _listed(unique)

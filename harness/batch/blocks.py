@@ -27,11 +27,13 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+import pyarrow as pa
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import LOST, Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.tables import MAX_TIME, MOST, lacking, unfit_names
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -327,16 +329,28 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
             raise ValueError(  # noqa: TRY004 - the data are wrong, not the call
                 f"its {name} is {str(value)[:60]!r}, wanted a value of type {kinds[0].__name__}"
             )
-    table = None
-    if (records := _unpack_array(steps)) is not None:
-        if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
-            raise ValueError("its steps are no numbers")
-        table = pd.DataFrame.from_records(records)
-        table.insert(0, RUN_ID, row[RUN_ID])
+        if isinstance(value, int | float) and name in MOST and (value < 0 or value > MOST[name]):
+            raise ValueError(f"its {name} is {value:g}")
+    if wrong := unfit_names(row):
+        raise ValueError(f"it {wrong}")
     image = _unpack_array(picture)
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
-    return RunResult(row, table, image, trace)
+    return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
+
+
+def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:
+    if (records := _unpack_array(text)) is None:
+        return None
+    if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
+        raise ValueError("its steps are no numbers")
+    table = pd.DataFrame.from_records(records)
+    table.insert(0, RUN_ID, run_id)
+    if wrong := unfit_names(table.columns) or lacking("steps", pa.Schema.from_pandas(table)):
+        raise ValueError(f"its table of steps {wrong}")
+    if not table["time_s"].between(0.0, MAX_TIME).all():
+        raise ValueError("its steps have no times")
+    return table
 
 
 def _pack_array(array: npt.NDArray[Any] | None) -> str | None:

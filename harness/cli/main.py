@@ -21,8 +21,10 @@ from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import harmless
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
+TOO_LONG = (errno.ENAMETOOLONG,)  # the name of a file, as of a run
 HELP_NAMES: Final = ["-h", "--help"]
 PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
 COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
@@ -127,6 +129,10 @@ def main() -> None:
         code = INTERRUPTED
     except typer.TyperException as error:
         _end(_usage_line(error))
+    except RecursionError:
+        if "--debug" in sys.argv:
+            raise
+        _end("the input is nested too deeply")
     except (ValueError, ImportError) as error:
         line = _line_for_user(error)
         if line is None:
@@ -159,7 +165,7 @@ def _say_where_a_signal_strikes() -> None:
 
 def _end(line: str) -> NoReturn:
     if line:
-        sys.stderr.write(f"servobench: {line}\n")
+        sys.stderr.write(f"servobench: {harmless(line)}\n")
     sys.exit(INPUT_ERROR)
 
 
@@ -180,7 +186,7 @@ def _line_of_system(error: OSError) -> str | None:
 
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)
-    if error.errno not in FULL:
+    if error.errno not in FULL + TOO_LONG:
         return None
     return f"{os.strerror(error.errno)}{f' ({error.filename})' if error.filename else ''}"
 

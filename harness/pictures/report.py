@@ -345,7 +345,7 @@ def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
 
 def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
     """Return a value as a reader wants it: no name of Python's for nothing, infinity or truth."""
-    if isinstance(value, list | tuple | set | dict):
+    if isinstance(value, list | tuple | set | dict | np.ndarray):
         return str(value)
     if pd.isna(value):
         return MISSING

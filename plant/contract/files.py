@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
+CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -60,6 +61,11 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
         raise ValueError(f"{kind} {path} cannot be read: {reason(error)}") from error
     except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
         raise ValueError(f"{kind} {path} is not valid TOML: {error}") from error
+
+
+def harmless(text: str) -> str:
+    """Return a text in which signs that a terminal obeys, or cannot print, are written by their number."""
+    return CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def reason(error: Exception) -> str:

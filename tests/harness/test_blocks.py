@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -235,6 +236,10 @@ def told(**changes: object) -> dict[str, object]:
     return {"row": row, "steps": None, "picture": None, "trace": ""} | changes
 
 
+def steps_of(**values: object) -> str | None:
+    return blocks._pack_array(pd.DataFrame(values, index=[0]).to_records(index=False))
+
+
 @pytest.mark.parametrize(
     ("answer", "why"),
     [
@@ -245,8 +250,20 @@ def told(**changes: object) -> dict[str, object]:
         (told(row=told()["row"] | {"run_id": "../../escaped"}), "it is that of another run"),
         (told(row=told()["row"] | {"status": 3}), "its status is '3', wanted a value of type str"),
         (told(row=told()["row"] | {"rms_error": "small"}), "its rms_error is 'small', wanted a value of type float"),
+        (told(row=told()["row"] | {"controller_time_p99_us": -math.inf}), "its controller_time_p99_us is -inf"),
+        (told(row=told()["row"] | {"saturation_fraction": 1.5}), "its saturation_fraction is 1.5"),
+        (
+            told(row=told()["row"] | {"two\nlines": 1.0}),
+            "it has two columns of one name, or a name that cannot be printed",
+        ),
         (told(steps="AAAA"), "reading magic string"),
         (told(steps=blocks._pack_array(np.array([("a",)], dtype=[("x", "U1")]))), "its steps are no numbers"),
+        (told(steps=steps_of(time_s=0.0)), "its table of steps lacks the column error_norm"),
+        (told(steps=steps_of(time_s=math.nan, error_norm=0.0)), "its steps have no times"),
+        (
+            told(steps=steps_of(time_s=0.0, error_norm=0.0, **{"a\x1b": 0.0})),
+            "its table of steps has two columns of one",
+        ),
         (told(picture=blocks._pack_array(np.zeros((2, 2)))), "its picture is no image"),
     ],
 )
@@ -256,7 +273,8 @@ def test_an_answer_that_was_falsified_is_refused(answer, why):
 
 
 def test_a_result_is_the_same_after_its_way_through_a_process():
-    steps = pd.DataFrame({"run_id": "a", "step": np.arange(3), "value": [0.1, np.nan, np.inf], "valid": [True] * 3})
+    numbers = {"step": np.arange(3), "time_s": 0.1 * np.arange(3), "error_norm": [0.1, np.nan, np.inf]}
+    steps = pd.DataFrame({"run_id": "a", **numbers, "valid": [True] * 3})
     row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row | {"rms_error": np.nan}
     steps["run_id"] = row["run_id"]
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
