@@ -28,7 +28,7 @@ MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
 WITHOUT = "mfac+constant"  # the regression alone
 LEARNERS = (WITHOUT, "mfac+ukf", "mfac+rbf", "mfac+true")
-FRESH = "139447:139647"  # from the hash of the last commit that changed code before they were drawn
+FRESH = "489214:489414"  # from the hash of the last commit that changed code before they were drawn
 LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
 
 
