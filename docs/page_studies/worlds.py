@@ -63,7 +63,7 @@ def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
     for (grade, name), runs in learning.groupby(["grade", "challenge"], sort=False):
         own = runs.set_index("controller")["score"]
         without = frozen[frozen["challenge"] == name].set_index("controller")["score"]
-        scores = {cells.quoted(each): f"{own[each]:.2f} / {without[each]:.2f}" for each in FROZEN}
+        scores = {cells.quoted(each): f"{own[each]:.2f}/{without[each]:.2f}" for each in FIVE}
         rows.append({"challenge": f"`{name}`", "grade": grade} | scores)
     return {"learning": pd.DataFrame(rows).sort_values("grade", kind="stable")}
 

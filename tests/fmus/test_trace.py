@@ -60,7 +60,7 @@ CASES = {
     "dynamic_rows": lambda a, b: lanes.pick(a, np.stack([np.argmin(b[0]), np.argmax(b[0])]), axes=1),
     "views": lambda a, b: view_written(a) + b,
     "mixed": lambda a, b: written_to_numbers(a) + b[:2],
-    "products": lambda a, b: lanes.outer(a, b).sum(axis=-1),
+    "outer_products": lambda a, b: lanes.outer(a, b).sum(axis=-1),
     "clipped": lambda a, b: np.clip(a, -0.5, 0.5) + b.T.T,
     "solution": lambda a, b: np.linalg.solve(a @ a.mT + np.eye(3), b) + np.linalg.inv(b @ b.mT + np.eye(3)),
     "factor": lambda a, b: np.linalg.cholesky(a @ a.mT + np.eye(3)) * np.linalg.det(b),
