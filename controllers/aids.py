@@ -88,7 +88,7 @@ class AidsConfig:
     """[1] by which a delay must be better than the present one, in −2 log likelihood."""
     score_memory: Share = 1.0
     """[1] share of a delay's score that is kept from one motion to the next; below 1 for a latency that changes."""
-    posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0)] = 0.6
+    posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0, log=True)] = 0.6
     """[1/s] gain of the null-space centring (`posture`)."""
     damping: Positive = 0.02
     """[m/rad] damping of the pseudo-inverse in feedforward, null-space centring and redistribution."""

@@ -162,8 +162,7 @@ class RbfEstimator(Estimator[RbfState]):
 
     def deviation(self, state: RbfState, first: RbfState | None, joint_position: FloatArray) -> FloatArray:
         """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
-        rows = state.rows if first is None else state.rows - first.rows
-        return self._features.jacobian(rows, joint_position)
+        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
 
     def jacobian(self, state: RbfState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
@@ -239,8 +238,7 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
         self, state: RbfLyapunovState, first: RbfLyapunovState | None, joint_position: FloatArray
     ) -> FloatArray:
         """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
-        rows = state.rows if first is None else state.rows - first.rows
-        return self._features.jacobian(rows, joint_position)
+        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
 
     def jacobian(self, state: RbfLyapunovState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""

@@ -17,22 +17,9 @@ FORMAT = "servobench networks"
 FORMAT_VERSION = 2
 MAX_UNPACKED = 256_000_000  # [bytes] sum of all arrays; trained networks have less than a hundredth of it
 READ_ERRORS = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, NotImplementedError, OSError, RuntimeError,
+    SyntaxError, TypeError, ValueError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 ARRAYS = ("centres", "widths", "weights")  # names of the arrays of either network
 
 

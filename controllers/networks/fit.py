@@ -24,7 +24,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
@@ -72,6 +71,8 @@ def choose_centres(pool: FloatArray, count: int, rng: np.random.Generator, place
     """
     if placement != "kmeans":
         return pool[:count].copy()
+    from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - when networks are trained alone, as above
+
     centres, _ = kmeans2(pool, count, minit="++", seed=rng, missing="warn")
     return np.asarray(centres, dtype=np.float64)
 

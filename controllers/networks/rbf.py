@@ -302,7 +302,7 @@ def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, .
 
 @final
 class FeatureMemo:
-    """Keeps θ and Ĵ of the last joint positions, which an estimator needs in `jacobian` and in the next `update`.
+    """Keeps what an estimator needs twice: θ and Ĵ of the last joint positions, and the change of the last weights.
 
     It saves time only: it is a memo of pure functions, and rows of weights never change.
     """
@@ -311,7 +311,7 @@ class FeatureMemo:
         """Take the network, with an empty memo."""
         self._network = network
         self._position, self._shape = b"", (-1,)
-        self._theta, self._rows, self._jacobian = (np.empty(0),) * 3
+        self._theta, self._rows, self._jacobian, self._changed, self._change = (np.empty(0),) * 5
 
     def at(self, q: FloatArray) -> FloatArray:
         """Return θ, (..., U, L), at q, (..., n), rad."""
@@ -328,3 +328,11 @@ class FeatureMemo:
             self._jacobian = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :]
             self._rows = rows
         return self._jacobian
+
+    def deviation(self, rows: FloatArray, first: FloatArray | None, q: FloatArray) -> FloatArray:
+        """Return Ĵ, (..., m, n), m/rad, at q with the change of the weights since `first`; as they are if None."""
+        if first is None:
+            return self.jacobian(rows, q)
+        if rows is not self._changed:
+            self._changed, self._change = rows, rows - first
+        return self.jacobian(self._change, q)

@@ -21,7 +21,9 @@ changes e only; the rest of P counts in s (a Schmidt-Kalman filter).
 
 How far the arm differs from its model is not known beforehand: filters with several prior deviations of E and H run
 side by side and are weighed by the evidence for each (Bayesian model averaging), from small ones, for which M is near
-a rotation, to large ones, for which the nominal model is hardly more than one regressor of many:
+a rotation, to large ones, for which the nominal model is hardly more than one regressor of many. With the smallest
+there is a second filter whose M walks seven times as fast: of a camera that turns while the arm moves, or of frames
+whose delay swings, which look alike. Evidence has to choose it, as the walk costs accuracy where the camera stands.
 
     ℓ_b ← ℓ_b + min(‖ν‖²/s', cap) + m ln s',   μ_b ∝ exp(−ℓ_b/2),   W̄ = Σ μ_b W_b
 
@@ -50,12 +52,12 @@ REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
 MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
 AGREEMENT: Final = 0.25  # [1] of ‖ν‖², below which ‖ν − e‖² says that a frame agrees with the one before
-DEVIATIONS: Final = np.array([0.01, 0.1, 0.4])  # [m/rad] prior deviation of an entry of E; per rad of H
-PRIOR: Final = np.array([0.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
+DEVIATIONS: Final = np.array([0.01, 0.01, 0.1, 0.4])  # [m/rad] prior deviation of an entry of E; per rad of H
+PRIOR: Final = np.array([0.0, 6.0, 6.0, 12.0])  # [1] −2 ln of the prior probability of each
 MODEL_ERROR: Final = 0.02  # [m/rad] c
-WALK: Final = np.array([0.0, 0.1, 0.1])  # [1/√rad] of E and H, as a share of their prior deviation
-MAP_WALK: Final = np.array([0.02, 0.0, 0.0])  # [1/√rad] of M
-ROTATION_DEVIATIONS: Final = np.array([0.1, 0.3])  # [1] ς, of an entry of M from the nearest rotation; then any M
+WALK: Final = np.array([0.0, 0.0, 0.1, 0.1])  # [1/√rad] of E and H, as a share of their prior deviation
+MAP_WALK: Final = np.array([0.02, 0.15, 0.0, 0.0])  # [1/√rad] of M
+ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])  # [1] ς, of an entry of M from the nearest rotation; then any M
 
 
 class Innovation(NamedTuple):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
 
 from page_studies import cells
-from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
-from servobench.controllers.aids import EQUIPPED
+from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, settings, sweep
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of
 from servobench.harness.analysis.statistics import median_with_interval
@@ -26,10 +24,18 @@ MISMATCHES = (
 )
 MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
-WITHOUT = "mfac+constant"  # the regression alone
-LEARNERS = (WITHOUT, "mfac+ukf", "mfac+rbf", "mfac+true")
-FRESH = "139447:139647"  # from the hash of the last commit that changed code before they were drawn
-LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
+FRESH = "489214:489414"  # from the hash of the last commit that changed code before they were drawn
+_UKF = {"aids.model": "nominal", "estimator.walk": "1e-12", "estimator.initial_deviation": "1e-12"}
+FROZEN: Final[Mapping[str, Mapping[str, str]]] = {
+    "regression_mfac": {"aids.model": "nominal"},
+    "ukf_mfac": _UKF,
+    "ukf_mpc": _UKF,
+    "rbf_pid": {"aids.model": "nominal", "estimator.n2": "1e-12", "estimator.n3": "1e-12"},
+    "rbfnn_mfac": {"aids.model": "nominal", "estimator.k2": "1e-9"},
+    "broyden": {"aids.model": "nominal", "estimator.step_factor": "1e-9"},
+    "rls": {"aids.model": "nominal", "estimator.initial_covariance": "1e-12", "estimator.memory": "1000"},
+    "cfdl_mfac": {"aids.model": "nominal", "estimator.step_factor": "1e-9"},
+}  # settings without which a method keeps the Jacobian of the nominal model
 
 
 def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -51,23 +57,15 @@ def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return what each learner does to the error on the circle and to moves, in chains that differ in nothing else."""
-    circles, moves = load_runs(folder / "circles"), load_runs(folder / "moves")
+    """Return mean scores with learning and without it, a row a challenge."""
+    learning, frozen = (pd.read_csv(folder / part / "methods.csv") for part in LEARNING.commands)
     rows = []
-    for world, own in circles.groupby("mismatch", sort=False):
-        without = own[own["controller"] == WITHOUT].set_index("seed")["rms_error_evaluated"]
-        for name, each in cells.by_method(own):
-            move = moves[(moves["mismatch"] == world) & (moves["controller"] == name)]
-            ratio = each.set_index("seed")["rms_error_evaluated"] / without
-            rows.append({
-                "world": f"`{world}`",
-                "estimator": cells.quoted(name.partition("+")[2]),
-                "circle, RMS of the second lap, mm": cells.millimetres(each, digits=2),
-                "over that of `constant`": cells.short(median_with_interval(ratio), 2),
-                "moves settled": str(cells.settled(move)),
-                "settling time, s": cells.settling(move),
-            })  # fmt: skip
-    return {"learning": pd.DataFrame(rows)}
+    for (grade, name), runs in learning.groupby(["grade", "challenge"], sort=False):
+        own = runs.set_index("controller")["score"]
+        without = frozen[frozen["challenge"] == name].set_index("controller")["score"]
+        scores = {cells.quoted(each): f"{own[each]:.2f}/{without[each]:.2f}" for each in FIVE}
+        rows.append({"challenge": f"`{name}`", "grade": grade} | scores)
+    return {"learning": pd.DataFrame(rows).sort_values("grade", kind="stable")}
 
 
 def scored(row: pd.Series[float]) -> str:
@@ -106,13 +104,6 @@ def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
         "ended early": cells.ended_early,
     }
     return {"pairs": pd.DataFrame(cells.rows_by_method(load_runs(folder / "pairs"), shown, title="pair"))}
-
-
-def chain(names: Iterable[str]) -> Words:
-    """Return the settings of the same chain for all pairs; the true Jacobian needs no map."""
-    values = {**{f"aids.{key}": word for key, word in EQUIPPED.items()}, "law.gain": 27.7, "law.step_weight": 4e-4}
-    own = {name: values | ({"aids.model": "own"} if name.endswith("+true") else {}) for name in names}
-    return settings(f"{name}.{key}={json.dumps(value)}" for name, each in own.items() for key, value in each.items())
 
 
 def path_ratio(runs: pd.DataFrame) -> str:
@@ -158,11 +149,17 @@ WORLDS = Study(
 )
 LEARNING = Study(
     "learning",
-    "what learned parts win where a map cannot do: 100 robots a world, chains that differ in the estimator only",
-    5,
+    "every equipped method in every challenge, with learning and frozen: 40 robots",
+    10,
     {
-        part: sweep("kinematic", LEARNERS, task, "9400:9500", "--mismatch", LEARNING_WORLDS, *chain(LEARNERS))
-        for part, task in (("circles", "circle"), ("moves", "random"))
+        part: (
+            *("suite", "--plants", "kinematic", "--controllers", ",".join(FROZEN), "--seeds", "489414:489454"),
+            *("--reference-seeds", "10", *words),
+        )
+        for part, words in {
+            "learning": (),
+            "frozen": settings(f"{name}.{key}={value}" for name, own in FROZEN.items() for key, value in own.items()),
+        }.items()
     },
     learning_table,
 )

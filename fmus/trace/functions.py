@@ -165,6 +165,12 @@ def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     return np.matmul(one, other)  # type: ignore[no-any-return]
 
 
+def _einsum(subscripts: str, a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
+    if subscripts != "...i,...j->...ij":
+        raise NotTraceable(f'it calls numpy.einsum("{subscripts}"), of which only products a bᵀ have an exported form')
+    return elementwise("multiply", as_traced(a)[..., :, None], as_traced(b)[..., None, :])
+
+
 def _where(condition: Any, *values: Any) -> Traced:  # noqa: ANN401 - as numpy's
     if len(values) != 2:
         raise NotTraceable("it looks for places by numbers that are known in the run only")
@@ -346,7 +352,7 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
     np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
     np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum, np.trace: _trace,
-    np.clip: _clip, np.dot: _dot, np.count_nonzero: _count_nonzero,
+    np.clip: _clip, np.dot: _dot, np.einsum: _einsum, np.count_nonzero: _count_nonzero,
     np.copy: lambda array: as_traced(array).copy(),
     np.shape: lambda array: array.shape, np.ndim: lambda array: array.ndim, np.size: lambda array: array.size,
     np.linalg.solve: solve, np.linalg.inv: inverse, np.linalg.cholesky: cholesky,

@@ -15,16 +15,7 @@ from servobench.harness.batch import results
 SIGNS: Final = str.maketrans(
     {sign: f"\\{sign}" for sign in "_%&#${}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    | {
-        "\u00a0": "~",
-        "∞": r"$\infty$",
-        "–": "--",
-        "−": "$-$",
-        "×": r"$\times$",
-        "µ": r"$\mu$",
-        "²": "$^2$",
-        "³": "$^3$",
-    }
+    | dict(zip("\u00a0∞–−×µ²³", ("~", r"$\infty$", "--", "$-$", r"$\times$", r"$\mu$", "$^2$", "$^3$"), strict=True))
 )
 INTERVAL: Final = re.compile(r" (\[[^\[]*\])$")
 NUMBER: Final = re.compile(r"[-+\d∞–]")

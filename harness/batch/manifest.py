@@ -22,18 +22,9 @@ from servobench.plant.robot.catalogue import WITH
 from servobench.plant.robot.mismatch import Mismatch
 
 PACKAGES = (
-    "servobench",
-    "numpy",
-    "scipy",
-    "pandas",
-    "pyarrow",
-    "pybullet",
-    "mujoco",
-    "control",
-    "casadi",
-    "fmpy",
+    "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",
     "opencv-python-headless",
-)
+)  # fmt: skip
 
 
 OWN = {  # keys of the place and the hash of a file or an object of users, by its kind

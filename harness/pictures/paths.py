@@ -163,14 +163,7 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
     first, second = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
     if first < second < len(reference):
-        look = {
-            "arrowstyle": "-|>",
-            "color": "black",
-            "linewidth": 1.2,
-            "mutation_scale": 14,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
+        look = {"arrowstyle": "-|>", "color": "black", "lw": 1.2, "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", reference[second], reference[first], arrowprops=look, zorder=9)
 
 

@@ -10,16 +10,19 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 JOINT_UNIT = "rad"
 COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
@@ -92,6 +95,8 @@ class Steps:
         if full_jacobian:
             columns.update(self._entries("estimated_jacobian", self.estimated_jacobian))
             columns.update(self._entries("true_jacobian", self.true_jacobian))
+        import pandas as pd  # noqa: PLC0415 - lists of names start without it
+
         return pd.DataFrame(columns)
 
     def _entries(self, kind: str, jacobian: FloatArray) -> Iterator[tuple[str, FloatArray]]:

@@ -275,8 +275,9 @@ def test_committed_values_reach_the_score_that_their_file_states_and_studies_bea
     assert score([costs[run] for run in range(len(runs))]) == pytest.approx(tuned.checked_score, abs=ROUNDING)
     if tuned.studies:
         assert tuned.score <= tuned.score_of_defaults
-        assert tuned.settings in [each.settings for each in tuned.studies]
-        assert tuned.second_score == min(each.second_score for each in tuned.studies)
+        best = min(tuned.studies, key=lambda study: study.second_score)
+        assert tuned.second_score <= best.second_score
+        assert tuned.settings == best.settings or tuned.second_score < best.second_score  # those in use before stay
 
 
 def test_committed_values_of_all_methods_have_the_same_budget_on_the_same_runs():

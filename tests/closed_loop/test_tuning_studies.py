@@ -162,7 +162,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
     assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (16, 48)
     assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [(0, 2, 1), (1, 2, 1)]
     on_second = [tuned.second_score_of_defaults, *(each.second_score for each in tuned.studies)]
-    assert tuned.second_score < min(on_second), "the values in use are the best, and are kept"
+    assert tuned.second_score <= min(on_second), "the values in use stay unless a study is better"
     assert tuned.settings == nested_settings(tuned_point(find_tunable("broyden:published")))
     first = SMALL.checked()
     (costs,) = [one[0].ledger.costs(tuned.settings)]

@@ -195,7 +195,7 @@ def toy_runs(words):
 
 
 def lay_out_suite(folder):
-    """Write the tables of a suite of one challenge with all methods that the study compares."""
+    """Write the tables of a suite of one challenge with all methods that studies compare."""
     folder.mkdir()
     own = {
         "challenge": "severe",
@@ -205,7 +205,8 @@ def lay_out_suite(folder):
         "score": 0.5,
         "good.value": 99.0,
     }
-    pd.DataFrame([{**own, "controller": name} for name in worlds.RENDERED]).to_csv(folder / "methods.csv")
+    methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN))
+    pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
     rank = {"rank": 1, "score.value": 0.5, "score.low": 0.4, "score.high": 0.6, "lost, %": 1.0, "within 2×": 0.5}
     pd.DataFrame([{**rank, "controller": name} for name in worlds.RENDERED]).to_csv(folder / "ranking.csv")
 
@@ -216,7 +217,8 @@ def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path
     monkeypatch.setattr(module, "load_steps", lambda *_: steps, raising=False)
     parts = [part for page in generated_tables.PAGES for part in generated_tables.PART.findall(page.read_text())]
     shown = {name for _, _, names, *_ in parts for name in names.split(",")}
-    lay_out_suite(tmp_path / "runs")
+    for part in ("runs", *worlds.LEARNING.commands):
+        lay_out_suite(tmp_path / part)
     for study in (value for value in vars(module).values() if isinstance(value, Study) and value.tables is not nothing):
         monkeypatch.setattr(module, "load_runs", lambda path, study=study: toy_runs(study.commands[path.name]))
         for name, table in study.tables(tmp_path).items():

@@ -60,6 +60,7 @@ CASES = {
     "dynamic_rows": lambda a, b: lanes.pick(a, np.stack([np.argmin(b[0]), np.argmax(b[0])]), axes=1),
     "views": lambda a, b: view_written(a) + b,
     "mixed": lambda a, b: written_to_numbers(a) + b[:2],
+    "outer_products": lambda a, b: lanes.outer(a, b).sum(axis=-1),
     "clipped": lambda a, b: np.clip(a, -0.5, 0.5) + b.T.T,
     "solution": lambda a, b: np.linalg.solve(a @ a.mT + np.eye(3), b) + np.linalg.inv(b @ b.mT + np.eye(3)),
     "factor": lambda a, b: np.linalg.cholesky(a @ a.mT + np.eye(3)) * np.linalg.det(b),
@@ -152,6 +153,7 @@ def test_what_ends_a_run_is_said_by_a_code(check, value, code):
     [
         (lambda x: x if x[0] > 0 else -x, "decides by a number"),
         (lambda x: np.linalg.eigh(x[:, None] * x), "numpy.eigh, which has no exported form"),
+        (lambda x: np.einsum("i,i->", x, x), "of which only products a bᵀ have an exported form"),
         (lambda x: np.logaddexp(x, x), "numpy.logaddexp, which has no exported form"),
         (
             lambda x: np.linalg.svd(x[None]),

@@ -6,15 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import servobench as package
-from kit.command import judged, servobench
+from kit.command import servobench
+from kit.lanes import assert_rows_of_single_runs
 from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.replay import logged_run
-from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
@@ -72,13 +72,8 @@ def test_its_noise_is_that_of_the_file():
 
 
 def test_runs_side_by_side_have_the_rows_of_single_ones():
-    requests = [request(seed=seed) for seed in (1, 2)]
     settings = Settings({"random": {"duration": 1.0}})
-    together = carry_out_together([resolve(each, settings) for each in requests])
-    for each, many in zip(requests, together, strict=True):
-        single = run_experiment(each, settings, steps=False)
-        both = [judged(pd.DataFrame([result.row])) for result in (many, single)]
-        pd.testing.assert_frame_equal(*both, check_exact=True)
+    assert_rows_of_single_runs([resolve(request(seed=seed), settings) for seed in (1, 2)])
 
 
 @pytest.mark.parametrize(("sensing", "robot"), [("pixel:hand", WORD), ("pixel", "ur5 with planned.toml"),

@@ -3,12 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kit.lanes import alone as one_by_one
+from kit.lanes import rows
 from kit.nightly import some
 from kit.plants import NEEDS_BULLET
 from servobench.controllers.laws.mfac import MfacLaw
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import carry_out, carry_out_together
+from servobench.harness.run.episode import carry_out_together
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
@@ -27,15 +29,6 @@ SEEDS = (40001, 40002, 40003, 40004, 40005)
 
 def runs(controller, settings, plant="kinematic", mismatch="severe", task="random"):
     return [resolve(RunRequest(plant, controller, task, mismatch, seed), Settings(settings)) for seed in SEEDS]
-
-
-def rows(results):
-    return [{name: value for name, value in each.row.items() if "_time_" not in name or "settling" in name}
-            for each in results]  # fmt: skip
-
-
-def one_by_one(resolved):
-    return rows(carry_out(run, steps=False) for run in resolved)
 
 
 SIDE_BY_SIDE = [name for name in METHODS if METHODS[name].side_by_side]

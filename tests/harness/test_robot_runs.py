@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from kit.command import judged
+from kit.lanes import assert_rows_of_single_runs
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
-from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
@@ -40,13 +39,9 @@ def test_the_ur5_is_not_named():
 
 
 def test_runs_of_a_panda_side_by_side_have_the_rows_of_single_ones():
-    requests = [replace(PANDA, task="random", seed=seed) for seed in (1, 2)]
     settings = Settings({"random": {"duration": 1.0}})
-    together = carry_out_together([resolve(each, settings) for each in requests])
-    for request, many in zip(requests, together, strict=True):
-        single = run_experiment(request, settings, steps=False)
-        both = [judged(pd.DataFrame([result.row])) for result in (many, single)]
-        pd.testing.assert_frame_equal(*both, check_exact=True)
+    requests = [replace(PANDA, task="random", seed=seed) for seed in (1, 2)]
+    assert_rows_of_single_runs([resolve(each, settings) for each in requests])
 
 
 @pytest.mark.parametrize("task", ["circle", "lemniscate", "line", "target", "unreachable", "endurance", "random"])

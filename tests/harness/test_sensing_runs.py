@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import servobench
+from kit.lanes import assert_rows_of_single_runs
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_sensing, named_files
@@ -18,7 +19,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import find_sensing, sensing_names
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
-from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.references import FollowedCurve
@@ -214,12 +215,7 @@ def test_runs_side_by_side_are_those_of_single_runs(word):
     runs = [resolve(request(word, seed=seed), Settings({})) for seed in (0, 1)]
     settings = runs[0]
     runs = [replace(run, run=settings.run, controller=settings.controller, task=settings.task) for run in runs]
-    together = carry_out_together(runs)
-    for run, many in zip(runs, together, strict=True):
-        one = run_experiment(run.request, Settings({})).row
-        same = {name for name in one if "time_median" not in name and "p99" not in name and "overruns" not in name}
-        for name in same:
-            assert many.row[name] == one[name] or (many.row[name] != many.row[name] and one[name] != one[name]), name
+    assert_rows_of_single_runs(runs)
 
 
 @pytest.mark.parametrize("word", PIXEL_WORDS)
