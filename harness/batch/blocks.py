@@ -174,14 +174,15 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
         done.extend(unpack_result(job.cell, item) for job, item in zip(block.jobs, answer.items, strict=False))
     except ValueError as error:
         reason = f"the answer of the run cannot be read: {error}"
-        end = End(Ending(CRASHED, reason), certain=block.fresh and not done)
-    if end is None:
+        end = End(Ending(CRASHED, reason), certain=False)
+    if end is None or len(done) == len(block.jobs):
         return done, []
     if not done and len(block.jobs) > 1 and block.together:
         return [], block.singly()
     single = replace(block, together=False)
     rest = single.part(len(done), fresh=True)
-    if not end.certain and not (block.fresh and len(block.jobs) == 1):
+    repeated = block.fresh and not done and (len(block.jobs) == 1 or not end.alone)
+    if not end.certain and not repeated:
         return done, rest.singly() if end.alone else [rest]
     done.append(_failed(block.jobs[len(done)].cell, end.ending))
     return done, [single.part(len(done))] if len(done) < len(block.jobs) else []

@@ -39,7 +39,6 @@ from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, End
 from servobench.plant.contract.faults import ConfigurationError
 
 LOST: Final = "the run killed the process that carried it out"
-STOPPED: Final = "the run stopped the process that guards it"
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
@@ -226,8 +225,7 @@ class Sandbox:
         while not link.poll(LOOK_EVERY):
             if limit is not None and time.monotonic() - began > limit:
                 return Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
-            if self._process is not None and processes.is_stopped(self._process.pid):
-                return Ending(CRASHED, STOPPED)
+            processes.wake(self._process)
         return None
 
     def _start(self, *, again: bool = True) -> Connection:
@@ -268,8 +266,7 @@ def _start_fault(link: Connection, process: BaseProcess) -> str:
         while not link.poll(LOOK_EVERY):
             if time.monotonic() > deadline:
                 return f"a worker process has not started within {GUARD_START:g} s"
-            if process.pid and processes.is_stopped(process.pid):
-                processes.send([process.pid], signal.SIGCONT)
+            processes.wake(process)
         if link.recv_bytes() == ALIVE:
             return ""
     process.join(STOP_TIME)
@@ -304,12 +301,13 @@ def _keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inheri
     for each in inherited:
         each.close()
     processes.lead_session()
-    processes.adopt_orphans()
-    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
+    processes.end_with_parent()  # as long as nothing is below this process
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     for name in modules:
         with contextlib.suppress(Exception):
             import_module(name)
+    processes.adopt_orphans()
+    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports
     guard = _Guard(link, limits)
     try:
@@ -356,9 +354,7 @@ class _Guard:
         self._trace.seek(0)
         self._trace.truncate()
         inherited = (self._link, self._below)
-        self._runner = context.Process(
-            target=_be_runner, args=(theirs, inherited, os.getpid(), self._limits, self._trace.fileno())
-        )
+        self._runner = context.Process(target=_be_runner, args=(theirs, inherited, self._limits, self._trace.fileno()))
         self._runner.start()
         theirs.close()
         self._owner, self._answers = task.owner, 0
@@ -368,9 +364,8 @@ class _Guard:
         """Pass the answers of the runner on until it is done; return its premature end."""
         limit = self._limits.time
         patience, since = (None if limit is None else max(limit, START_TIME)), time.monotonic()
-        limited = limit is not None or self._limits.memory is not None
         while True:
-            ready = wait([below, self._link], LOOK_EVERY if limited else None)
+            ready = wait([below, self._link], LOOK_EVERY)
             if below in ready:
                 message = below.recv_bytes(MAX_ANSWER)
                 if message[:1] == DONE:
@@ -391,7 +386,8 @@ class _Guard:
                 return end
 
     def _check_processes(self) -> End | None:
-        """Check memory and number of the processes below; end them if it is too much."""
+        """Check memory and number of the processes below; end them if it is too much, and continue a stopped runner."""
+        processes.wake(self._runner)
         below = processes.descendants(os.getpid())
         if len(below) > MAX_PROCESSES:
             return self._end(CRASHED, f"the run started more than {MAX_PROCESSES} processes")
@@ -405,7 +401,7 @@ class _Guard:
     def _find_end(self) -> End:
         """Return the end of a runner that is gone, or whose link is."""
         self._runner.join(TRACE_TIME)
-        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=not self._answers)
+        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=False)
 
     def _end(self, status: str, reason: str, *, certain: bool = True) -> End:
         """End the runner and all below it."""
@@ -433,13 +429,14 @@ class _Guard:
         processes.end_descendants()
 
 
-def _be_runner(link: Connection, inherited: Sequence[Connection], parent: int, limits: Limits, trace: int) -> None:
+def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int) -> None:
     """Be a runner: take tasks from the guard until it is gone."""
     processes.lead_session()
-    processes.end_with(parent)
+    processes.end_with_parent()
     for each in inherited:
         each.close()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, lambda *_: None)  # of somebody else; not ignored, which programs started here inherit
     signal.pthread_sigmask(signal.SIG_SETMASK, set())
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)

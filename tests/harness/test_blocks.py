@@ -7,7 +7,6 @@ import itertools
 import json
 import math
 from concurrent.futures import Future
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -15,7 +14,7 @@ import pytest
 
 from kit.command import judged
 from servobench.harness.batch import blocks, results
-from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.sandbox import Answer, End, Workers
@@ -118,8 +117,7 @@ def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
             if how.alone:  # the last answer is lost with the guard
                 future.set_result(Answer(items[:-1], how))
             else:
-                end = replace(how, certain=how.certain or (task.fresh and not items))
-                future.set_result(Answer(items, end))
+                future.set_result(Answer(items, how))
         return future
 
     return Workers(submit, 2, lost=(ProcessDied,))
@@ -161,6 +159,25 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
     assert set(runs["reason"][lost]) == {"it died"}
     pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
     assert sum(sizes) <= len(runs) + 8 * 4 + again * 4
+
+
+@pytest.mark.parametrize("answers", [0, 1, 3])
+def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer_are_carried_out_again(answers):
+    sizes: list[int] = []
+
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
+        told = [blocks.pack_result(RunResult.failed(identity(each.cell.request), Ending())) for each in block.jobs]
+        sizes.append(len(block.jobs))
+        future = Future()
+        end = End(Ending("crashed", "SIGTERM"), certain=False) if len(sizes) == 1 else None
+        future.set_result(Answer(told[:answers] if end else told, end))
+        return future
+
+    outcomes = list(carry_out_blocks([Block(tuple(job(index, None) for index in range(3)))], Workers(submit)))
+    assert [result.row["seed"] for _, found in outcomes for result in found] == [0, 1, 2]
+    assert all(result.row["status"] == "completed" for _, found in outcomes for result in found)
+    assert sizes == [3, 3 - answers][: 1 + (answers < 3)]
 
 
 def job(index: int, kind: object) -> Job:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -96,7 +97,7 @@ def test_ctrl_c_does_not_reach_the_first_guard_while_it_starts(tmp_path):
     assert done.stdout == "True\n", done.stderr
 
 
-STOPPED = """
+KILLED = """
 import os, pickle, signal, time
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits
@@ -107,28 +108,51 @@ def hold(seconds, tell):
     time.sleep(seconds)
 
 if __name__ == "__main__":
-    pool = Pool(1, Limits(time=600.0), ())
+    starts = {starts}
+    pool = Pool(1, Limits(time=600.0), ["imported"] * starts)
     pool.submit(Task(hold, pickle.dumps(600)))
-    while len(below := processes.descendants(os.getpid())) < 3:  # resource tracker, guard and runner
+    while len(below := processes.descendants(os.getpid())) < 3 - starts:  # resource tracker, guard and runner
         time.sleep(0.05)
-    (guard,) = (each for each in below if processes.descendants(each))
+    while starts and not os.path.exists("begun"):
+        time.sleep(0.05)
     print(*below, flush=True)
-    os.kill(guard, signal.SIGSTOP)
+    for guard in below:
+        if processes.descendants(guard):
+            os.kill(guard, signal.SIGSTOP)
     os.kill(os.getpid(), signal.SIGKILL)
 """
+SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
 
 
 @pytest.mark.slow
-def test_a_guard_that_is_stopped_ends_with_the_process_that_started_it(tmp_path):
-    (tmp_path / "killed.py").write_text(STOPPED)
+@pytest.mark.parametrize("starts", [False, True])
+def test_a_guard_that_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
+    (tmp_path / "killed.py").write_text(KILLED.format(starts=starts))
+    (tmp_path / "imported.py").write_text(SLOW)
     path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
-    done = subprocess.run([sys.executable, str(tmp_path / "killed.py")], capture_output=True, text=True, env=path,
-                          check=False, timeout=120)  # fmt: skip
+    done = subprocess.run([sys.executable, "killed.py"], capture_output=True, text=True, env=path, check=False,
+                          timeout=120, cwd=tmp_path)  # fmt: skip
     assert done.returncode == -signal.SIGKILL, done.stderr
     below, deadline = [int(word) for word in done.stdout.split()], time.monotonic() + 5.0
     while left := [each for each in below if psutil.pid_exists(each) and psutil.Process(each).status() != "zombie"]:
         assert time.monotonic() < deadline, left
         time.sleep(0.05)
+
+
+def wait_for_file(path: Path, tell) -> None:
+    tell(os.getpid())
+    while not path.exists():
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGSTOP", "SIGINT"])
+def test_a_runner_that_somebody_stops_or_interrupts_goes_on(name, tmp_path):
+    def disturb(runner: object) -> None:
+        os.kill(runner, signal.Signals[name])
+        (tmp_path / "file").touch()
+
+    assert sandbox.call(wait_for_file, tmp_path / "file", Limits(time=30.0), disturb) is None
 
 
 def harm(how: str, tell) -> None:
@@ -149,7 +173,7 @@ def harm(how: str, tell) -> None:
         ("return", None),
         ("exit", ("crashed", "the run killed the process that carried it out: exit code 3")),
         ("hang", ("timed_out", "the run took longer than 3 s")),
-        ("stop", ("crashed", "the run stopped the process that guards it")),
+        ("stop", ("timed_out", "the run took longer than 3 s")),
     ],
 )
 def test_a_call_returns_how_its_function_ended(how, end):
