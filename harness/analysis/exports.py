@@ -120,7 +120,7 @@ def _topics(steps: pd.DataFrame) -> dict[str, dict[str, str]]:
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table
     """Return a cell for JSON; None where it is not finite."""
-    if value is None or isinstance(value, bool | np.bool_):
-        return None if value is None else bool(value)
-    number = float(value)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = math.nan if value is None else float(value)
     return number if math.isfinite(number) else None

@@ -11,6 +11,7 @@ costs at most the time of the runs once more. The one module that imports Dask.
 """
 
 import contextlib
+import json
 import math
 import pickle
 import re
@@ -172,20 +173,18 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
     done, end = list[RunResult](), answer.end
     try:
         done.extend(unpack_result(job.cell, item) for job, item in zip(block.jobs, answer.items, strict=False))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
         end = End(Ending(CRASHED, reason), certain=False)
     if end is None or len(done) == len(block.jobs):
         return done, []
     if not done and len(block.jobs) > 1 and block.together:
         return [], block.singly()
-    single = replace(block, together=False)
-    rest = single.part(len(done), fresh=True)
-    repeated = block.fresh and not done and (len(block.jobs) == 1 or not end.alone)
-    if not end.certain and not repeated:
-        return done, rest.singly() if end.alone else [rest]
-    done.append(_failed(block.jobs[len(done)].cell, end.ending))
-    return done, [single.part(len(done))] if len(done) < len(block.jobs) else []
+    single, at = replace(block, together=False), len(done)
+    rest = [single.part(at + 1)] if at + 1 < len(block.jobs) else []
+    if not end.certain and not block.fresh:  # a fresh block is one run, and its own second attempt
+        return done, [single.part(at, at + 1, fresh=True), *rest]
+    return [*done, _failed(block.jobs[at].cell, end.ending)], rest
 
 
 def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
@@ -310,18 +309,15 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
     """
     match told:
         case {
-            "row": dict(row),
-            "steps": str() | None as steps,
-            "picture": str() | None as picture,
-            "trace": str(trace),
-        }:
+            "row": dict(row), "steps": str() | None as steps, "picture": str() | None as picture, "trace": str(trace)
+        }:  # fmt: skip
             pass
         case _:
             raise ValueError("it is not the result of a run")
-    known = _failed(cell, Ending()).row
+    known, own = _failed(cell, Ending()).row, {**cell.request.as_row(), **cell.columns}
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
-    if row[RUN_ID] != known[RUN_ID]:
+    if any(json.dumps(row[name]) != json.dumps(value) for name, value in own.items() if name != "robot"):
         raise ValueError("it is that of another run")
     for name, value in row.items():
         usual = str if name in TEXTS else float

@@ -58,9 +58,8 @@ class Batch:
         return self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
 
 
-def _request(
-    robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
-) -> RunRequest:
+def _request(robot: str, *values: Any) -> RunRequest:  # noqa: ANN401 - those of `Batch.axes`
+    sensing, plant, task, mismatch, controller, seed = values
     return RunRequest(plant, controller, task, mismatch, seed, robot=robot, sensing=sensing)
 
 
@@ -246,17 +245,8 @@ def _varied(keys: Sequence[str], *values: Value) -> Varied:
     return tuple(zip(keys, values, strict=True))
 
 
-def _cell(
-    robot: str,
-    place: Place,
-    varied: Varied,
-    sensing: str,
-    plant: str,
-    task: str,
-    mismatch: Mismatch,
-    *names: Any,  # noqa: ANN401
-) -> Cell:
-    controller, seed = names
+def _cell(robot: str, place: Place, varied: Varied, *values: Any) -> Cell:  # noqa: ANN401 - as above
+    sensing, plant, task, mismatch, controller, seed = values
     request = RunRequest(plant, controller, task, place.vary(mismatch), seed, varied, robot, sensing)
     return Cell(request, place.columns)
 

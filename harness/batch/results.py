@@ -282,6 +282,24 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     return steps
 
 
+def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield name and content of each further table of a folder, without runs and steps, such as answered claims.
+
+    Raises:
+        ConfigurationError: one of them cannot be read.
+    """
+    for path in sorted(folder.iterdir()):
+        own = path.name in (RUNS, STEPS) or path.name.startswith(".")
+        if own or path.suffix not in (".parquet", ".csv"):
+            continue
+        try:
+            table = pd.read_csv(path) if path.suffix == ".csv" else tables.read_tables(folder, [path.name])
+        except (OSError, ValueError, OverflowError) as error:
+            why = error.fault if isinstance(error, DamagedFile) else " ".join(str(error).split())
+            raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
+        yield path.stem, table
+
+
 def has_steps(folder: Path) -> bool:
     """Return whether a results folder has a table of steps."""
     return (folder / STEPS).is_file() or bool(part_names(folder, STEPS))

@@ -14,6 +14,7 @@ import contextlib
 import faulthandler
 import gc
 import json
+import math
 import os
 import pickle
 import signal
@@ -75,7 +76,6 @@ class End:
 
     ending: Ending
     certain: bool  # whether its current run is the cause, and no earlier run of the same runner
-    alone: bool = False  # whether only a run with a task of its own can be certain: answers may have been lost
 
 
 @dataclass(frozen=True)
@@ -180,11 +180,12 @@ class Sandbox:
         Raises:
             ConfigurationError: no process can be started.
         """
-        answer = Answer()
+        answer, limit = Answer(), math.inf if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
+        silence = Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
         try:
             link = self._start()
             link.send_bytes(pickle.dumps(task))
-            while not (silence := self._wait(link)):
+            while self._hears(link, limit):
                 message = link.recv_bytes()
                 kind, content = message[:1], message[1:]
                 if kind == DONE:
@@ -197,7 +198,7 @@ class Sandbox:
         except (EOFError, OSError):
             silence = Ending(CRASHED, LOST)
         self.end(0.0)  # it is gone or of no use, and nothing may wait for it when this process ends
-        return Answer(answer.items, End(silence, certain=False, alone=True))
+        return Answer(answer.items, End(silence, certain=False))
 
     def ask_to_end(self) -> None:
         """Ask the guard to end the processes below it, and itself."""
@@ -218,15 +219,14 @@ class Sandbox:
             process.kill()
             process.join()
 
-    def _wait(self, link: Connection) -> Ending | None:
-        """Wait for a message; return why there will be none."""
-        limit = None if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
-        began = time.monotonic()
+    def _hears(self, link: Connection, limit: float) -> bool:
+        """Wait for a message, and return whether one came within a time [s]; a stopped guard is continued."""
+        deadline = time.monotonic() + limit
         while not link.poll(LOOK_EVERY):
-            if limit is not None and time.monotonic() - began > limit:
-                return Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
+            if time.monotonic() > deadline:
+                return False
             processes.wake(self._process)
-        return None
+        return True
 
     def _start(self, *, again: bool = True) -> Connection:
         """Return the link to a guard that runs; one that is ended while it starts is started once `again`."""
@@ -248,7 +248,7 @@ class Sandbox:
                 process.start()
             self._process = process
         theirs.close()
-        if fault := _start_fault(ours, process):
+        if fault := self._start_fault(ours, process):
             ended = process.exitcode  # before the next line ends it
             ours.close()
             self.end(0.0)
@@ -258,24 +258,20 @@ class Sandbox:
         self._link = ours
         return ours
 
-
-def _start_fault(link: Connection, process: BaseProcess) -> str:
-    """Wait until a guard has started and return why it has not; empty if it has."""
-    deadline = time.monotonic() + GUARD_START
-    with contextlib.suppress(EOFError, OSError):
-        while not link.poll(LOOK_EVERY):
-            if time.monotonic() > deadline:
+    def _start_fault(self, link: Connection, process: BaseProcess) -> str:
+        """Wait until a guard has started and return why it has not; empty if it has."""
+        with contextlib.suppress(EOFError, OSError):
+            if not self._hears(link, GUARD_START):
                 return f"a worker process has not started within {GUARD_START:g} s"
-            processes.wake(process)
-        if link.recv_bytes() == ALIVE:
-            return ""
-    process.join(STOP_TIME)
-    if process.exitcode not in (None, START_ERROR):
-        return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
-    return (
-        "the worker processes cannot be started; a script that starts some must keep its calls below "
-        "`if __name__ == '__main__':`"
-    )
+            if link.recv_bytes() == ALIVE:
+                return ""
+        process.join(STOP_TIME)
+        if process.exitcode not in (None, START_ERROR):
+            return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
+        return (
+            "the worker processes cannot be started; a script that starts some must keep its calls below "
+            "`if __name__ == '__main__':`"
+        )
 
 
 def _read(content: bytes) -> Any:  # noqa: ANN401 - JSON

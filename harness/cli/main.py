@@ -23,8 +23,8 @@ from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import harmless
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
-TOO_LONG = (errno.ENAMETOOLONG,)  # the name of a file, as of a run
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
+        errno.ENAMETOOLONG)  # fmt: skip
 HELP_NAMES: Final = ["-h", "--help"]
 PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
 COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
@@ -129,11 +129,7 @@ def main() -> None:
         code = INTERRUPTED
     except typer.TyperException as error:
         _end(_usage_line(error))
-    except RecursionError:
-        if "--debug" in sys.argv:
-            raise
-        _end("the input is nested too deeply")
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, RecursionError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
@@ -186,17 +182,19 @@ def _line_of_system(error: OSError) -> str | None:
 
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)
-    if error.errno not in FULL + TOO_LONG:
+    if error.errno not in FULL:
         return None
     return f"{os.strerror(error.errno)}{f' ({error.filename})' if error.filename else ''}"
 
 
-def _line_for_user(error: ValueError | ImportError) -> str | None:
+def _line_for_user(error: ValueError | ImportError | RecursionError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
 
     if isinstance(error, ImportError):
         return missing_extra(error, "this command")
+    if isinstance(error, RecursionError) and "--debug" not in sys.argv:
+        return "the input is nested too deeply"
     return str(error) if isinstance(error, ConfigurationError) else None
 
 
