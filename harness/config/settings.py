@@ -111,10 +111,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     """
     sections: dict[str, Any] = {}
     if path is not None:
-        try:
-            sections = read_toml("configuration file", path)
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from error
+        sections = read_toml("configuration file", path)
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")

@@ -181,11 +181,8 @@ def find_challenge(word: str) -> Challenge:
     """
     if not word.endswith(SUFFIX) and word not in challenge_names():
         raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
-    try:
-        path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
-        values = read_toml("challenge", path)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+    path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
+    values = read_toml("challenge", path)
     try:
         values["task"] = choose_task(values.get("task", ""))
         values |= {"camera": str(path.parent / values["camera"])} if "camera" in values else {}
