@@ -138,7 +138,7 @@ def _place(error: BaseException) -> _Place | None:
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and is_defect(error):
         ours = [each for each in frames if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
-        own = [each for each in ours if each[0].f_globals["__name__"] != ConfigurationError.__module__]  # it converts
+        own = [each for each in ours if each[0].f_globals.get("__name__") != ConfigurationError.__module__]
     if not own:
         return None
     frame, line = own[-1]
