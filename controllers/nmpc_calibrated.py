@@ -124,6 +124,12 @@ class NmpcCalibrated(Controller):
         self._program = QpProgram(self._shape, config.solver)
         self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0  # of points, not of pixels
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
+        self._b: FloatArray = np.zeros(m)
+        self._offsets: FloatArray = np.zeros((self._frames, m))
+        self._past: FloatArray | None = None
+        self._plan: FloatArray = np.zeros((blocks.count, n))
+        self._sent: FloatArray = np.zeros((len(self._to_come), n))
+        self._jacobian: FloatArray | None = None
         self._forget()
 
     def reset(self, observation: Observation, seed: int) -> None:
@@ -180,14 +186,13 @@ class NmpcCalibrated(Controller):
 
     def _forget(self) -> None:
         n = self._spec.n
-        self._plan: FloatArray = np.zeros((self._blocks.count, n))
-        self._sent: FloatArray = np.zeros((len(self._to_come), n))
-        self._last: FloatArray = np.zeros(n)
-        self._b: FloatArray = np.zeros(self._spec.m)
-        # The model counts as right until half of the offsets differ.
-        self._offsets: FloatArray = np.zeros((self._frames, self._spec.m))
-        self._past: FloatArray | None = None
-        self._jacobian: FloatArray | None = None
+        self._plan = np.zeros((self._blocks.count, n))
+        self._sent = np.zeros((len(self._to_come), n))
+        self._last = np.zeros(n)
+        self._b = np.zeros(self._spec.m)
+        self._offsets = np.zeros((self._frames, self._spec.m))  # the model counts as right until half of them differ
+        self._past = None
+        self._jacobian = None
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
 

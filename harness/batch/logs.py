@@ -1,10 +1,10 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
 import re
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
@@ -14,10 +14,13 @@ from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
 
-READERS: Final[Mapping[str, Callable[..., Any]]] = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+TABLES: Final = (".csv", ".parquet")  # suffixes
+MAX_PERIOD: Final = 2.0  # [s] between rows of a log
+TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
 CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plants, controllers and set-ups
 TASK: Final = "circle"  # likewise, without effect
@@ -90,17 +93,33 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
     Raises:
         ConfigurationError: a file that cannot be read, or a name that cannot be used.
     """
-    reader = READERS.get(path.suffix)
-    if reader is None:
-        raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(READERS)}")
-    try:
-        table = reader(path)
-        period = float(table["time_s"].diff().median())
-    except KeyError as error:
-        raise ConfigurationError(f"{path} is no table with a column time_s") from error
-    except (OSError, ValueError, TypeError) as error:
-        raise ConfigurationError(f"{path} is no table with a column time_s: {error}") from error
-    if not period > 0.0:
-        raise ConfigurationError(f"{path} needs two rows or more whose time_s grows; it has {len(table)}")
-    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, (("period", period),), robot, sensing)
+    if path.suffix not in TABLES:
+        raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(TABLES)}")
+    table = read_table("log", path)
+    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, (("period", _period(path, table)),), robot, sensing)
     return resolve(request, Settings()), table
+
+
+def _period(path: Path, table: pd.DataFrame) -> float:
+    """Return the control period [s] of a log, the median distance of its rows.
+
+    Raises:
+        ConfigurationError: there is one row only, or times are not in s, not sorted, or not a period apart.
+    """
+    times = numbers_of(f"log {path}", table, ["time_s"])[:, 0]
+    steps = np.diff(times)
+    period = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
+    if not 0.0 < period <= MAX_PERIOD:
+        needed = "it needs two or more, and time_s in s, not in ms"
+        raise ConfigurationError(f"log {path} has {len(times)} rows, {period:g} s apart; {needed}")
+    nearest = round(period, 6)
+    if abs(nearest - period) <= np.spacing(np.abs(times).max()):  # times since 1970 are rounded in double precision
+        period = nearest
+    late = np.abs(times - times[0] - period * np.arange(len(times))) > TIME_TOLERANCE
+    if late.any():
+        row = int(late.argmax())
+        raise ConfigurationError(
+            f"log {path}: row {row} is {steps[row - 1]:g} s after the row before, and rows must be the control period "
+            f"of {period:g} s apart: sort them, leave out doubled ones, or resample the log at equal steps"
+        )
+    return period

@@ -109,8 +109,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     """
     sections: dict[str, Any] = {}
     if path is not None:
-        with configuration_errors():
-            sections = read_toml("configuration file", path)
+        sections = read_toml("configuration file", path)
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")

@@ -11,7 +11,6 @@ For a user's camera the curve is about the middle of the workspace as that camer
 hand about the target at home; ρ is at most 1, and smaller by as much as less of the workspace is in the image.
 """
 
-import csv
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy.typing as npt
 from servobench.harness.run.log import column_unit
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
-from servobench.plant.contract.files import reason
+from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.robot import Robot
@@ -127,23 +126,8 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     Raises:
         ValueError: the file is missing, lacks a column, or holds something that is not a finite number.
     """
-    wanted = ("time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names))
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"waypoint file {path} cannot be read: {reason(error)}") from error
-    if not rows or any(name not in rows[0] for name in wanted):
-        raise ValueError(f"waypoint file {path} must have a header and rows with the columns {', '.join(wanted)}")
-    values = np.empty((len(rows), len(wanted)))
-    for i, row in enumerate(rows):
-        for j, name in enumerate(wanted):
-            try:
-                values[i, j] = float(row[name])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"waypoint file {path}, row {i + 1}: {name} is not a number: {row[name]!r}") from error
-    if not np.isfinite(values).all():
-        raise ValueError(f"waypoint file {path} holds a number that is not finite")
+    names = ["time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names)]
+    values = numbers_of(f"waypoint file {path}", read_table("waypoint file", path), names)
     try:
         return Waypoints(values[:, 0], values[:, 1:])
     except ValueError as error:

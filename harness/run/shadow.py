@@ -19,17 +19,18 @@ from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.hand_eye import RobotModel
 
+LOG: Final = "the log"  # in error messages
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
 MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
 MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
 MAX_LATE: Final = 12  # control periods by which features may be late
 MAX_SHARE_APART: Final = 0.35  # share of the motion by which features may differ without a remark
-TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
 
 @final
@@ -44,24 +45,16 @@ class LoggedPlant(Plant):
 
         Args:
             spec: names, units and period.
-            table: a row a control period, with columns as `steps.parquet` has them; `feature_valid` and
-                `true_feature_…` may be missing.
+            table: a row a control period, with columns as `steps.parquet` has them; times do not count, and
+                `feature_valid` and `true_feature_…` may be missing.
 
         Raises:
-            ConfigurationError: a column or a number is missing, or the rows are not a control period apart.
+            ConfigurationError: a column or a number is missing.
         """
         self.spec, self._k = spec, 0
-        time = _columns(table, ["time_s"])[:, 0]
-        self._time = time - time[0]
-        late = np.abs(self._time - spec.period * np.arange(len(time)))
-        if late.max() > TIME_TOLERANCE:
-            row = int(late.argmax())
-            raise ConfigurationError(
-                f"rows of a log must be the control period of {spec.period:g} s apart, but row {row} of {len(time)} is "
-                f"at {time[row]:g} s after {time[0]:g} s"
-            )
         names = column_names(spec)
-        self._joints, self._features = _columns(table, names["joint_position"]), _columns(table, names["feature"])
+        given = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
+        self._joints, self._features = given
         valid = table["feature_valid"] if "feature_valid" in table else np.ones(len(table))
         self._valid = np.asarray(valid, dtype=np.bool_)
         true = names["true_feature"]
@@ -114,12 +107,12 @@ class LoggedPlant(Plant):
 
     def step(self, command: Command) -> Observation:
         """Return the next row; the command is ignored. See `Plant.step`."""
-        self._k = min(self._k + 1, len(self._time) - 1)
+        self._k = min(self._k + 1, len(self._joints) - 1)
         return self._row()
 
     def _row(self) -> Observation:
         k = self._k
-        return Observation(float(self._time[k]), self._joints[k], self._features[k], bool(self._valid[k]))
+        return Observation(k * self.spec.period, self._joints[k], self._features[k], bool(self._valid[k]))
 
     def truth(self) -> Truth:
         """Return the true feature of the log, NaN where it has none."""
@@ -151,7 +144,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         log = StepLog(spec, len(table))
         loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
         desired = experiment.desired(loop.periods)
-        logged = _columns(table, column_names(spec)["reference"])
+        logged = numbers_of(LOG, table, column_names(spec)["reference"])
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
         with careful():
@@ -164,7 +157,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     steps = log.steps().table(request.run_id)
     names = column_names(spec)[COMMAND]
     if set(names) <= set(table):
-        steps[[LOGGED + name for name in names]] = commands = _columns(table, names)
+        steps[[LOGGED + name for name in names]] = commands = numbers_of(LOG, table, names)
         if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
             remark(
                 f"commands of the log reach {np.abs(commands).max():g} rad/s; if they are in deg/s, write them in rad/s"
@@ -208,20 +201,3 @@ def differences(steps: pd.DataFrame) -> pd.DataFrame:
     joints = [name.removeprefix(f"{COMMAND}_") for name in names]
     columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
     return pd.DataFrame(dict(zip(columns, (joints, *rms, np.abs(apart).max(axis=0)), strict=True)))
-
-
-def _columns(table: pd.DataFrame, names: list[str]) -> FloatArray:
-    """Return the numbers of columns, (k, …).
-
-    Raises:
-        ConfigurationError: one of them is missing, or has something else than finite numbers, or there are no rows.
-    """
-    missing = [name for name in names if name not in table]
-    if missing or table.empty:
-        raise ConfigurationError(f"the log has no {f'column {missing[0]}' if missing else 'rows'}; it needs "
-                                 f"{', '.join(names)}")  # fmt: skip
-    values: FloatArray = table[names].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
-    if not np.isfinite(values).all():
-        row, column = np.argwhere(~np.isfinite(values))[0].tolist()
-        raise ConfigurationError(f"row {row} of the log has no finite number in {names[column]}")
-    return values

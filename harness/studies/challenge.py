@@ -181,9 +181,8 @@ def find_challenge(word: str) -> Challenge:
     """
     if not word.endswith(SUFFIX) and word not in challenge_names():
         raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
-    with configuration_errors():
-        path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
-        values = read_toml("challenge", path)
+    path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
+    values = read_toml("challenge", path)
     with configuration_errors(f"{path}: "):
         values["task"] = choose_task(values.get("task", ""))
         values |= {"camera": str(path.parent / values["camera"])} if "camera" in values else {}

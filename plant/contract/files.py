@@ -1,12 +1,18 @@
-"""Atomic writing of files, and reading of TOML with errors of one line."""
+"""Atomic writing of files, and reading of a user's TOML and CSV with errors of one line."""
 
+import io
 import os
 import re
 import threading
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
@@ -52,14 +58,62 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
         path: the file.
 
     Raises:
-        ValueError: it cannot be read, or is not valid TOML.
+        ConfigurationError: it cannot be read, or is not valid TOML.
     """
+    text = read_text(kind, path)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{kind} {path} cannot be read: {reason(error)}") from error
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
-        raise ValueError(f"{kind} {path} is not valid TOML: {error}") from error
+        raise ConfigurationError(f"{kind} {path} is not valid TOML: {error}") from error
+
+
+def read_text(kind: str, path: Path) -> str:
+    """Return the text of a file without the byte-order mark that some editors begin it with; see `read_toml`."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{kind} {path} is no text in UTF-8; save it in this encoding") from error
+    except OSError as error:
+        raise ConfigurationError(f"{kind} {path} cannot be read: {reason(error)}") from error
+
+
+def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as above
+    """Return the table of a Parquet file or else of a CSV file, of which blanks do not count; see `read_toml`."""
+    import pandas as pd  # noqa: PLC0415 - lists of names start without it
+
+    text = None if path.suffix == ".parquet" else read_text(kind, path)
+    header = (text or ",").partition("\n")[0].strip()
+    if "," not in header and (marks := [mark for mark in (";", "\t", " ") if mark in header]):
+        raise ConfigurationError(
+            f"{kind} {path} has {marks[0]!r} between its columns; write commas, and numbers as 0.5"
+        )
+    try:
+        table = pd.read_parquet(path) if text is None else pd.read_csv(io.StringIO(text), skipinitialspace=True)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"{kind} {path} is no table: {error}") from error
+    if text is not None and type(table.index) is not pd.RangeIndex:  # the first cells were taken for names of rows
+        raise ConfigurationError(f"{kind} {path} has rows of more cells than its header; write numbers as 0.5")
+    return table.rename(columns=str.strip)
+
+
+def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # noqa: ANN401 - as above
+    """Return the numbers of columns of a DataFrame, (k, len(names)); `what` it is stands in error messages.
+
+    Raises:
+        ConfigurationError: one of them is missing or has something else than finite numbers, or there are no rows.
+    """
+    import pandas as pd  # noqa: PLC0415 - as above
+
+    lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty
+    if lacking:
+        raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
+    values = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0].tolist()
+        cell = str(table[names[column]].iloc[row])
+        came = "nothing, or nan" if cell == "nan" else repr(cell)
+        raise ConfigurationError(f"{what}, row {row}: {names[column]} must be a finite number, got {came}")
+    return np.asarray(values)
 
 
 def reason(error: Exception) -> str:
@@ -71,12 +125,12 @@ def user_path(text: str) -> Path:
     """Return a path as written by a user, in which ~ stands for a home folder.
 
     Raises:
-        ValueError: there is no such home folder.
+        ConfigurationError: there is no such home folder.
     """
     try:
         return Path(text).expanduser()
     except RuntimeError as error:
-        raise ValueError(f"path {text!r} names a home folder that is not known") from error
+        raise ConfigurationError(f"path {text!r} names a home folder that is not known") from error
 
 
 def partial_path(path: Path) -> Path:

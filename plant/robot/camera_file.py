@@ -18,7 +18,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.files import read_toml, reason
+from servobench.plant.contract.files import read_text, read_toml
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Number, Positive, nested, override, settings
 from servobench.plant.robot.camera import PinholeCamera
@@ -213,11 +213,9 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: a file that cannot be read, or a key that is missing.
     """
+    text = read_text("file", path)
     try:
-        text = path.read_text(encoding="utf-8")
         found: Any = yaml.load(text.partition("\n")[2] if text.startswith("%YAML") else text, _Loader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path.name} cannot be read: {reason(error)}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
     keys = dict[str, Any]()

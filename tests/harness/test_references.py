@@ -49,7 +49,7 @@ def test_a_line_moves_at_constant_speed_and_rests_at_its_end():
 
 def test_waypoints_come_back_from_a_file(tmp_path):
     file = tmp_path / "points.csv"
-    file.write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n2,1,0,1\n")
+    file.write_text("time_s, x_m, y_m, z_m\n0,0,0,1\n2,1,0,1\n", encoding="utf-8-sig")  # as spreadsheets write it
     np.testing.assert_allclose(read_waypoints(file, FEATURE).at(1.0), [0.5, 0, 1])
 
 
@@ -58,7 +58,7 @@ def test_the_columns_of_a_waypoint_file_have_the_unit_of_the_feature(tmp_path):
     file.write_text("time_s,u_px,v_px\n0,0,0\n2,100,50\n")
     pixels = Channel(("u", "v"), "px", 1000.0, np.zeros(2), np.full(2, 1000.0))
     np.testing.assert_allclose(read_waypoints(file, pixels).at(1.0), [50, 25])
-    with pytest.raises(ValueError, match="the columns time_s, x_m, y_m, z_m"):
+    with pytest.raises(ValueError, match="points.csv has no column x_m; it needs time_s, x_m, y_m, z_m"):
         read_waypoints(file, FEATURE)
 
 

@@ -97,10 +97,24 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(steps, tmp
     ("change", "message"),
     [
         (lambda table: table.drop(columns="feature_y_m"), "the log has no column feature_y_m; it needs feature_x_m, "),
-        (lambda table: table.drop(index=5), "but row 5 of 79 is at 0.3 s after 0 s"),
-        (lambda table: table.assign(reference_z_m="near"), "row 0 of the log has no finite number in reference_z_m"),
-        (lambda table: table.iloc[:0], "needs two rows or more whose time_s grows; it has 0"),
-        (lambda table: table.drop(columns="time_s"), "is no table with a column time_s"),
+        (lambda table: table.drop(index=[5, 50]), "row 5 is 0.1 s after the row before, .*: sort them, .* resample"),
+        (lambda table: table.assign(reference_z_m="near"), "row 0: reference_z_m must be a finite number, got 'near'"),
+        (lambda table: table.iloc[:0], "robot.csv has no rows"),
+        (lambda table: table.iloc[:1], "has 1 rows, 0 s apart; it needs two or more"),
+        (
+            lambda table: table.loc[table.index.repeat(2)],
+            "row 1 is 0 s after the row before, .* leave out doubled ones",
+        ),
+        (lambda table: table.iloc[::-1], "row 1 is -0.05 s after the row before"),
+        (lambda table: table.drop(columns="time_s"), "robot.csv has no column time_s"),
+        (
+            lambda table: table.assign(time_s=1000.0 * table["time_s"]),
+            "has 80 rows, 50 s apart; it needs two or more, and time_s in s, not in ms",
+        ),
+        (
+            lambda table: table.assign(time_s=[f"{time} s" for time in table["time_s"]]),
+            "row 0: time_s must .* got '0.0 s'",
+        ),
     ],
 )
 def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message):
@@ -108,6 +122,15 @@ def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message)
     change(pd.read_csv(as_file(steps, path))).to_csv(path, index=False)
     with pytest.raises(ConfigurationError, match=message):
         shadow(*logged_in_file(path, "constant", "ur5", "position"))
+
+
+def test_a_log_whose_clock_counts_from_1970_is_shown_like_one_that_begins_at_0(steps, tmp_path):
+    path = tmp_path / "robot.csv"
+    table = pd.read_csv(as_file(steps, path))
+    seen = shadow(*logged_in_file(path, "constant", "ur5", "position"))
+    table.assign(time_s=1.76e9 + table["time_s"]).to_csv(path, index=False)
+    late = shadow(*logged_in_file(path, "constant", "ur5", "position"))
+    np.testing.assert_allclose(commands(late), commands(seen), rtol=1e-5)
 
 
 def test_what_is_no_log_is_refused(folder, tmp_path):

@@ -13,13 +13,17 @@ from kit.folders import comparison
 RUN = ("run", "--plant", "kinematic", "--controller", "constant")
 COMPARE = ("compare", "--controllers", "constant", "--tasks", "exp2")
 SWEEP = ("sweep", "--controllers", "constant", "--out", "new")
-FILES = {  # name -> content
+FILES: dict[str, str | bytes] = {  # name -> content
     "unknown_section.toml": "[kinematc]\nlag = 0.1\n",
     "bad_value.toml": "[ukf_mpc.law]\nhorizon_time = -1\n",
     "no_section.toml": "lag = 0.1\n",
     "text.csv": "time_s,x_m,y_m,z_m\n0,0,0,far\n",
     "backwards.csv": "time_s,x_m,y_m,z_m\n1,0,0,1.2\n0,0,0,1.2\n",
     "columns.csv": "t,x,y,z\n0,0,0,1.2\n",
+    "semicolons.csv": "time_s;x_m;y_m;z_m\n0;0,5;0;1,25\n",
+    "decimal_commas.csv": "time_s,x_m,y_m,z_m\n0,0,0,5,0,0,1,25\n",
+    "empty.csv": "",
+    "utf_16.toml": "[kinematic]\nlag = 0.1\n".encode("utf-16"),
     "far.csv": "time_s,x_m,y_m,z_m\n0,0,0,1.25\n5,0,9,1.25\n",
     "list.yaml": "kinematics:\n  - 1\n",
     "arm_mm.toml": "a = [0, -425]\nd = [0, 0]\nalpha = [0, 0]\njoint_lower = []\njoint_upper = []\njoint_speed = []\n",
@@ -94,9 +98,13 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--task", "line", "--set", "line.end=[200,100,1200]"), "a point of its curve, (200, 100, 1200) m"),
     ((*RUN, "--task", "waypoints"), "task waypoints: a CSV file is needed: --set waypoints.file=PATH"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=far.csv"), "task waypoints: a point of its curve"),
-    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=text.csv"), "text.csv, row 1: z_m is not a number: 'far'"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=text.csv"), "row 0: z_m must be a finite number, got 'far"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=backwards.csv"), "waypoint times must ascend"),
-    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=columns.csv"), "with the columns time_s, x_m, y_m, z_m"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=columns.csv"), "has no column time_s; it needs time_s"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=semicolons.csv"), "has ';' between its columns; write"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=decimal_commas.csv"), "more cells than its header"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=empty.csv"), "waypoint file empty.csv is no table"),
+    ((*RUN, "--config", "utf_16.toml"), "utf_16.toml is no text in UTF-8; save it in this encoding"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=no.csv"), "waypoint file no.csv cannot be read"),
     # lists, seeds and places
     ((*RUN, "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
@@ -175,7 +183,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("shadow", "file", "--controller", "constant"), "file must be a results folder, or a table in .csv or .parquet"),
     (("shadow", "results"), "results holds 9 runs; name one with --run, such as"),
     (("shadow", "text.csv"), "text.csv does not say which controller to show it to; name one with --controller"),
-    (("shadow", "columns.csv", "--controller", "constant"), "columns.csv is no table with a column time_s"),
+    (("shadow", "columns.csv", "--controller", "constant"), "log columns.csv has no column time_s; it needs time_s"),
     (("shadow", "text.csv", "--controller", "constant", "--sensing", "pixl"), "did you mean 'pixel'?"),
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "it holds something that is no formula"),
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
@@ -214,7 +222,7 @@ def place(tmp_path_factory) -> Path:
     """A folder with files that are wrong in one way or another."""
     folder = tmp_path_factory.mktemp("wrong")
     for name, content in FILES.items():
-        (folder / name).write_text(content)
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     (folder / "file").write_text("not a folder")
     (folder / "full").mkdir()
     (folder / "full" / "note.txt").write_text("mine")
