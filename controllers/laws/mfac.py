@@ -7,7 +7,7 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 """
 
 import math
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
@@ -46,12 +46,8 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
     return np.asarray(step_factor * np.vecmat(np.linalg.solve(square, e[..., None])[..., 0], J))
 
 
-class MfacState(NamedTuple):
-    """The law has no state."""
-
-
 @final
-class MfacLaw(Law[MfacState]):
+class MfacLaw(Law[None]):
     """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 45)."""
 
     def __init__(self, config: MfacConfig, knowledge: RobotKnowledge) -> None:
@@ -59,13 +55,12 @@ class MfacLaw(Law[MfacState]):
         self._dt = knowledge.spec.period
         self._share, self._weight = 1.0 - math.exp(-config.gain * self._dt), config.step_weight
 
-    def start(self, observation: Observation) -> MfacState:
-        """Return the empty state."""
-        return MfacState()
+    def start(self, observation: Observation) -> None:
+        """Begin; the law has no state."""
 
     def command(
-        self, state: MfacState, estimate: Estimate, observation: Observation, reference: FloatArray
-    ) -> tuple[MfacState, FloatArray]:
+        self, state: None, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[None, FloatArray]:
         """Return u, (..., n), rad/s; see `Law.command`."""
         e = reference[..., 0, :] - observation.feature
         return state, mfac_step(estimate.jacobian, e, self._share, self._weight) / self._dt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from base64 import b64decode
 from pathlib import Path
 
 from PIL import Image
@@ -12,7 +13,7 @@ from servobench.harness.batch import results
 from servobench.harness.pictures.figures import folder_figures
 from servobench.harness.pictures.film import draw_frame
 from servobench.harness.pictures.replay import logged_run
-from servobench.harness.pictures.style import picture_of
+from servobench.harness.pictures.style import drawing_of
 
 SHOWN = "circle"  # the task whose film gives a frame
 PERIOD = 150  # of the run shown: three quarters of a lap
@@ -34,7 +35,7 @@ def readme_pictures(folder: Path) -> dict[str, bytes]:
     row = {str(name): value for name, value in runs[runs["task"] == SHOWN].iloc[0].items()}
     frame = draw_frame(logged_run(row, results.load_steps(batch, [row["run_id"]]), {}), PERIOD)
     figures = {
-        f"pictures/{FILES[named.kind]}.png": picture_of(named.figure)[0]
+        f"pictures/{FILES[named.kind]}.png": b64decode(drawing_of(named.figure).data)
         for named in folder_figures(batch)
         if named.kind in FILES
     }

@@ -14,7 +14,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from textwrap import shorten
 from typing import Any, Final, Generic, Self, TypeVar, overload
 
@@ -50,7 +50,7 @@ class Batch:
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
-        return Grid(partial(_request, self.robot), *self.axes())
+        return Grid(_request, [self.robot], *self.axes())
 
     def axes(self) -> tuple[Sequence[Any], ...]:
         """Return sensing set-ups, plants, tasks, mismatches, controllers and seeds."""
@@ -238,25 +238,13 @@ class SweepPlan:
                 if axis in dict(read_mismatch(text).axes):
                     raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
         places = [Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes]
-        varied = Grid(partial(_varied, [name for name, _ in self.settings]), *(values for _, values in self.settings))
-        return Grid(partial(_cell, self.batch.robot), places or [Place()], varied, *self.batch.axes())
+        names = [name for name, _ in self.settings]
+        varied = Grid(lambda *values: tuple(zip(names, values, strict=True)), *(values for _, values in self.settings))
+        return Grid(_cell, places or [Place()], varied, [self.batch.robot], *self.batch.axes())
 
 
-def _varied(keys: Sequence[str], *values: Value) -> Varied:
-    return tuple(zip(keys, values, strict=True))
-
-
-def _cell(
-    robot: str,
-    place: Place,
-    varied: Varied,
-    sensing: str,
-    plant: str,
-    task: str,
-    mismatch: Mismatch,
-    *names: Any,  # noqa: ANN401
-) -> Cell:
-    controller, seed = names
+def _cell(place: Place, varied: Varied, *own: Any) -> Cell:  # noqa: ANN401 - as those of `_request`
+    robot, sensing, plant, task, mismatch, controller, seed = own
     request = RunRequest(plant, controller, task, place.vary(mismatch), seed, varied, robot, sensing)
     return Cell(request, place.columns)
 

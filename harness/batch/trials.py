@@ -27,7 +27,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault
+from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault, configuration_errors
 
 if TYPE_CHECKING:
     from servobench.fmus.inspection import Validation
@@ -262,10 +262,8 @@ def validate(path: Path) -> Validation:
 def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:
     from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
 
-    try:
+    with configuration_errors("", FmuError):
         found = validate_fmu(path)
-    except (ValueError, FmuError) as error:
-        raise ConfigurationError(str(error)) from error
     return found.problems, found.deviation
 
 
@@ -289,10 +287,8 @@ def _build_plant(name: str, robot_name: str) -> None:
     setup = PlantSetup(robot.nominal, robot.workspace.home, period, robot)
     if entry.own_robot:
         setup = PlantSetup(None, None, period)
-    try:
+    with configuration_errors(f"plant {name}: "):
         plant = entry.build(entry.config() if entry.config_for is None else entry.config_for(robot), setup)
-    except ValueError as error:
-        raise ConfigurationError(f"plant {name}: {error}") from error
     with contextlib.suppress(Exception):  # `servobench check plant` reports it
         plant.close()
 

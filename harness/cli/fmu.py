@@ -14,9 +14,8 @@ import typer
 from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
-from servobench.harness.cli.terminal import FAILED, console, say
-from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason
+from servobench.harness.cli.terminal import FAILED, console, say, writing
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
@@ -43,13 +42,8 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        try:
+        with configuration_errors(), writing(Path(tempfile.gettempdir())):
             yield parse_platforms(self.platforms)
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from error
-        except OSError as error:
-            place = error.filename or tempfile.gettempdir()
-            raise ConfigurationError(f"{place} cannot be written: {reason(error)}") from error
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
@@ -150,10 +144,8 @@ def info(file: FileArgument) -> None:
 
     from servobench.fmus.inspection import read_information, shape_of
 
-    try:
+    with configuration_errors():
         information = read_information(file)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
     described = information.description
     say(f"{described.modelName}: FMI {described.fmiVersion}, {', '.join(information.interfaces)}")
     token = described.guid or described.instantiationToken

@@ -18,7 +18,7 @@ import typer
 
 from servobench.harness.batch.processes import Bounds, read_size
 from servobench.harness.cli import selection
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution
@@ -260,10 +260,8 @@ class Limited:
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
-        try:
+        with configuration_errors("--run-memory: "):
             memory = None if self.run_memory is None else read_size(self.run_memory)
-        except ValueError as error:
-            raise ConfigurationError(f"--run-memory: {error}") from error
         return Bounds(self.run_timeout, memory, self.isolate)
 
 

@@ -10,7 +10,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
 from servobench.harness.cli.results import judge, say_aids
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import configuration_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -222,11 +222,9 @@ def tune(
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
 
     names = selection.split_names("controllers", controllers, tuple(SPACES), find_tunable)
-    try:
+    with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):

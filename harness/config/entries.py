@@ -27,7 +27,7 @@ from servobench.harness.config.source import PLACE, SourceFile, describe_at, dig
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError, PlantDiverged, RunFault
+from servobench.plant.contract.faults import ConfigurationError, PlantDiverged, RunFault, configuration_errors
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings, suggest
 from servobench.plant.contract.signals import PlantSpec
@@ -251,10 +251,8 @@ class _ControllerKind(Kind[ControllerEntry]):
         check_settings(entry.config, place)
         guarded = replace(entry, build=(build := _guarded(entry.build, Controller)))
         aids = getattr(build.make, "aids", None)
-        try:
+        with configuration_errors(f"{place}: "):
             return guarded if aids is None else with_aids(guarded, aids)
-        except ValueError as error:
-            raise ConfigurationError(f"{place}: {error}") from error
 
 
 class _PlantKind(Kind[PlantEntry]):

@@ -22,7 +22,7 @@ from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, Ow
 from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.source import describe_at, is_place
 from servobench.plant.bench.plant import PlantEntry
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
 
@@ -96,10 +96,8 @@ class Registry(Generic[Entry]):
         Raises:
             ConfigurationError: no such name, or an entry that cannot be made or loaded.
         """
-        try:
+        with configuration_errors():
             made = self.made(name)
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from error
         if made is not None:
             return made
         given = _OFFERED.get(name)

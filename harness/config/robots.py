@@ -8,7 +8,7 @@ from typing import Final
 from servobench.harness.config.source import PLACE, SourceFile
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.robot import Robot
 
@@ -16,16 +16,14 @@ DEFAULT_ROBOT: Final = ur5.UR5
 OWN_ROBOT: Final = "own"  # in the column `robot`: the plant brings it
 
 
+@configuration_errors()
 def find_robot(name: str) -> Robot:
     """Return the robot that a name or the path of a file stands for.
 
     Raises:
         ConfigurationError: an unknown name, or a file that cannot be used.
     """
-    try:
-        return catalogue.find_robot(name)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+    return catalogue.find_robot(name)
 
 
 def with_camera(robot: str, camera: Path) -> str:
@@ -62,10 +60,8 @@ def find_sensing(word: str) -> Sensing:
 def _find(word: str, file: SourceFile | None) -> Sensing:
     place, found = _place(word)
     own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
-    try:
+    with configuration_errors():
         return Sensing.parse(word, {**SETUPS, **own})
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
 
 
 def sensing_file(word: str) -> SourceFile | None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import listed, override, suggest
 
@@ -84,16 +84,14 @@ class Settings:
                     f"{listed(names)}; settings of other runs may stand in a file (--config)"
                 )
 
+    @configuration_errors()
     def resolve(self, section: str, default: Config) -> Config:
         """Return the configuration `default` with the overrides of `section` applied.
 
         Raises:
             ConfigurationError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
         """
-        try:
-            return override(section, default, self.sections.get(section, {}))
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from error
+        return override(section, default, self.sections.get(section, {}))
 
 
 def _is_section(given: object) -> bool:

@@ -17,10 +17,10 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
-from servobench.harness.pictures.tracks import Track, track_of
+from servobench.harness.pictures.tracks import Track, track_of, values_drawn
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.room import Overview, Room
@@ -98,10 +98,8 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         )
     model, moved = _true_model(row, robot)
     known = {item.name for item in fields(RenderedConfig)}
-    try:
+    with configuration_errors(f"run {run_id}: settings of the camera in the manifest: ", TypeError):
         config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
-    except (ValueError, TypeError) as error:
-        raise ConfigurationError(f"run {run_id}: settings of the camera in the manifest: {error}") from error
     q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
@@ -206,14 +204,12 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
     Raises:
         ConfigurationError: its mismatch cannot be sampled, or its values are not those of the table.
     """
-    try:
+    with configuration_errors(f"run {row['run_id']}: "):
         mismatch = Mismatch.parse(row["mismatch"])
         model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
-    except ValueError as error:
-        raise ConfigurationError(f"run {row['run_id']}: {error}") from error
     if mismatch.size("camera_turn") > 0.0:
         raise ConfigurationError(f"run {row['run_id']} cannot be shown: films have no camera that turns")
-    logged, drawn = json.loads(row.get("mismatch_values") or "{}"), json.loads(json.dumps(sample.as_record()))
+    logged, drawn = values_drawn(row), json.loads(json.dumps(sample.as_record()))
     if any(logged.get(name) != value for name, value in drawn.items()):
         raise ConfigurationError(
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "

@@ -330,8 +330,16 @@ def box_of(figure: Figure) -> Bbox:
     return Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
 
 
-def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
-    """Return a figure as a small, sharp PNG, and width and height with which it is to be shown, px.
+class Drawing(NamedTuple):
+    """A figure in a page, with the size [px] at which its type is as large as that of the page."""
+
+    data: str  # the PNG file, base64
+    width: int
+    height: int
+
+
+def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
+    """Return a figure as a small, sharp PNG for a page.
 
     The picture is as high as the drawing: nothing is cut, and there is no empty strip.
     """
@@ -343,21 +351,8 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
     with Image.open(large) as picture:
         indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         indexed.save(small, "PNG", optimize=True)
-    return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
-
-
-class Drawing(NamedTuple):
-    """A figure in a page, with the size [px] at which its type is as large as that of the page."""
-
-    data: str  # the PNG file, base64
-    width: int
-    height: int
-
-
-def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
-    """Return a figure for a page; see `picture_of`."""
-    content, width, height = picture_of(figure, layout)
-    return Drawing(base64.b64encode(content).decode("ascii"), width, height)
+    content = base64.b64encode(small.getvalue()).decode("ascii")
+    return Drawing(content, round(layout.scale * box.width), round(layout.scale * box.height))
 
 
 def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[str]]:

@@ -31,7 +31,7 @@ from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
@@ -81,6 +81,7 @@ def draw(resolved: ResolvedRun) -> Drawn:
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
 
 
+@configuration_errors()
 def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraDraws | None]:
     """Draw the true robot of a run with its cameras, and return the drawn values, too.
 
@@ -88,11 +89,8 @@ def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraD
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
     robot, seed = find_robot(request.robot), named_seed(request.seed, "mismatch")
-    try:
-        arm, sample = sample_mismatch(request.mismatch, robot, seed)
-        true, cameras = find_sensing(request.sensing).true(robot, arm, sample, request.mismatch, seed)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+    arm, sample = sample_mismatch(request.mismatch, robot, seed)
+    true, cameras = find_sensing(request.sensing).true(robot, arm, sample, request.mismatch, seed)
     return true, sample, cameras
 
 
@@ -107,10 +105,8 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         others = ", ".join(name for name, entry in TASKS.items() if entry.default.any_robot)
         why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
         raise ConfigurationError(f"task {name}: {why}")
-    try:
+    with configuration_errors(f"task {name}: "):
         scenario = task.scenario(setting)
-    except ValueError as error:
-        raise ConfigurationError(f"task {name}: {error}") from error
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
@@ -298,10 +294,8 @@ def train_networks(
     run = settings.resolve("run", RunSettings())
     plant = KinematicConfig()
     robot = find_robot(robot_name)
-    try:
+    with configuration_errors():
         nominal, limits = find_sensing(sensing).nominal(robot), robot.limits
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
     spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
     knowledge = nominal_knowledge(robot, nominal, spec, run)
     if knowledge.nominal_jacobian is None:
@@ -327,10 +321,8 @@ def _equations(model: RobotModel | None) -> TrueModel:
 
 
 def _build_plant(resolved: ResolvedRun, entry: PlantEntry, setup: PlantSetup) -> Plant:
-    try:
+    with configuration_errors(f"plant {resolved.request.plant}: ", RunFault):
         return entry.build(resolved.plant, setup)
-    except (ValueError, RunFault) as error:
-        raise ConfigurationError(f"plant {resolved.request.plant}: {error}") from error
 
 
 def _build_controller(
@@ -338,7 +330,7 @@ def _build_controller(
 ) -> Controller:
     """Build a controller; the truth goes only to one that asks for it, as the nominal model where there is none."""
     entry = find_controller(name)
-    try:
+    with configuration_errors(f"controller {name}: "):
         if entry.needs_truth:
             true = true_model()
             nominal = knowledge.nominal_jacobian or true.jacobian
@@ -352,8 +344,6 @@ def _build_controller(
                 true_tool=true.tool,
             )
         return entry.build(config, knowledge)
-    except ValueError as error:
-        raise ConfigurationError(f"controller {name}: {error}") from error
 
 
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
@@ -388,10 +378,8 @@ def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
         return
     unit, scale = nominal.channel.unit, nominal.noise_unit
     whole = nominal.optics.size[0] if isinstance(nominal, SetupModel) and unit == "px" else 1.0
-    try:
+    with configuration_errors(f"{resolved.request.plant}."):
         extents = sensing.extents(unit, scale)
-    except ValueError as error:
-        raise ConfigurationError(f"{resolved.request.plant}.{error}") from error
     for name, metres in extents._asdict().items():
         given, size, place = getattr(sensing, name), scale * metres, f"{resolved.request.plant}.sensing.{name}"
         if unit not in ("px", "m") or size <= (1.0 if name == "outlier_size" else 0.1) * whole:

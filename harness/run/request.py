@@ -13,7 +13,7 @@ from annotated_types import Ge
 
 from servobench.harness.config.robots import DEFAULT_ROBOT, short_name
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot.catalogue import WITH
@@ -235,10 +235,8 @@ def read_mismatch(text: str) -> Mismatch:
     """
     if not isinstance(text, str):
         raise ConfigurationError(f"mismatch must be a text such as 'moderate' or 'links=10%', got {text!r}")
-    try:
+    with configuration_errors():
         return Mismatch.parse(text)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
 
 
 def read_seed(seed: object) -> int:

@@ -18,7 +18,7 @@ from servobench.harness.run.request import RunRequest, RunSettings, Varied
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
 
@@ -40,10 +40,8 @@ class Sections(dict[str, Any]):
         if not changes:
             return self[section]
         if (section, changes) not in self._changed:
-            try:
+            with configuration_errors():
                 self._changed[section, changes] = override(section, self[section], nest(dict(changes)))
-            except ValueError as error:
-                raise ConfigurationError(str(error)) from error
         return self._changed[section, changes]
 
 
@@ -114,10 +112,8 @@ def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # no
     if camera is not None and (entry.own_robot or not entry.any_sensing):
         raise ConfigurationError(f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply")
     config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
-    try:
+    with configuration_errors():
         return config if camera is None else replace(config, sensing=camera.sensing(config.sensing, period))
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
 
 
 def select(request: RunRequest, sections: Sections) -> ResolvedRun:

@@ -137,7 +137,8 @@ def _place(error: BaseException) -> _Place | None:
     frames = list(traceback.walk_tb(error.__traceback__))
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
     if not own and is_defect(error):
-        own = [(frame, line) for frame, line in frames if Path(frame.f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
+        ours = [each for each in frames if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
+        own = [each for each in ours if each[0].f_globals.get("__name__") != ConfigurationError.__module__]
     if not own:
         return None
     frame, line = own[-1]

@@ -31,7 +31,7 @@ from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import SHORT_NAMES
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import choose_task
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.contract.settings import (
     Count,
@@ -183,11 +183,9 @@ def find_challenge(word: str) -> Challenge:
         raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
     path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
     values = read_toml("challenge", path)
-    try:
+    with configuration_errors(f"{path}: "):
         values["task"] = choose_task(values.get("task", ""))
         values |= {"camera": str(path.parent / values["camera"])} if "camera" in values else {}
         challenge = override("challenge", Challenge(path.stem), values)
         challenge.check()
-    except ValueError as error:
-        raise ConfigurationError(f"{path}: {error}") from error
     return challenge

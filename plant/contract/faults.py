@@ -15,6 +15,8 @@
 A plant or controller of a third party derives its own from `RunFault`.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 
@@ -73,3 +75,15 @@ class ConfigurationError(ValueError):
         """Keep the message without line ends and without characters that would control a terminal."""
         words = " ".join(message.split())
         super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))
+
+
+@contextmanager
+def configuration_errors(place: str = "", further: type[Exception] = ValueError) -> Iterator[None]:
+    """Raise a ValueError, or an error of a further type, as a `ConfigurationError` with `place` before its message.
+
+    Around statements, `with configuration_errors():`, or around a whole function as its decorator.
+    """
+    try:
+        yield
+    except (ValueError, further) as error:
+        raise ConfigurationError(f"{place}{error}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import shutil
+from base64 import b64decode
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,10 @@ from servobench.harness.pictures.style import (
     TEXT,
     WIDE,
     Layout,
+    drawing_of,
     figure_style,
     fitted,
     method_styles,
-    picture_of,
 )
 from servobench.harness.pictures.tracks import Track, load_groups
 from servobench.plant.contract.checksums import write_vouched
@@ -120,7 +121,7 @@ def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_
         for figure, layout in ((wide.figure, WIDE), (narrow.figure, NARROW)):
             assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= TEXT - 2.0
             figure.suptitle("")
-            _, width, _ = picture_of(figure, layout)
+            width = drawing_of(figure, layout).width
             assert width <= layout.pixels + 2
         columns = {round(axes.get_position().x0, 2) for axes in narrow.figure.axes if axes.get_visible()}
         assert len(columns) <= 2  # panels below each other, differing by the width of their numbers
@@ -161,10 +162,10 @@ def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
     gaps.loc[5:9, ["true_feature_x_m", "feature_x_m"]] = np.nan
     rows = [made_up_row("a", controller="ukf_mfac"), made_up_row("b", controller="rbf_pid")]
     folder = write_folder(tmp_path / "out", rows, [short, gaps])
-    drawn = [picture_of(named.figure) for named in folder_figures(folder)]
+    drawn = [drawing_of(named.figure) for named in folder_figures(folder)]
     assert drawn
     for picture, width, height in drawn:
-        assert picture.startswith(b"\x89PNG")
+        assert b64decode(picture).startswith(b"\x89PNG")
         assert min(width, height) > 100
 
 
@@ -260,7 +261,7 @@ def test_a_picture_for_a_page_keeps_the_colour_of_each_method(tmp_path):
     styles = method_styles(CONTROLLERS)
     with figure_style(TEXT):
         figure = draw_conditions(moves, styles)
-    with Image.open(io.BytesIO(picture_of(figure, WIDE)[0])) as picture:
+    with Image.open(io.BytesIO(b64decode(drawing_of(figure, WIDE).data))) as picture:
         known = np.asarray(picture.convert("RGB")).reshape(-1, 3).astype(int)
     for name in moves["controller"].unique():
         wanted = [int(styles[name].colour[i : i + 2], 16) for i in (1, 3, 5)]
