@@ -39,8 +39,8 @@ WORD = "ur10e with mine.toml"
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(CAMERA + ON_FLANGE)
-    turned = "rotation = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]\n"
-    Path("aside.toml").write_text(CAMERA + '[pose]\nframe = "base"\nposition = [0.0, 0.5, 1.55]\n' + turned)
+    aside = CAMERA.replace("615.0", "500.0") + '[pose]\nframe = "base"\nposition = [0.0, 0.5, 1.55]\n'
+    Path("aside.toml").write_text(aside + "rotation = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]\n")
     Path("planned.toml").write_text(CAMERA.replace('noise = "0.5px"', ""))
 
 
