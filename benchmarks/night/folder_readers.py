@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
+from servobench.harness.analysis.folder import describe_folder, describe_settings
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch import results
 from servobench.harness.batch.integrity import examine
@@ -65,7 +65,7 @@ def part_name(name: str, folder: Path) -> None:
 def other_table(text: str, folder: Path) -> None:
     """Read a folder with a table of somebody beside those of the batch."""
     place = _write(folder / "out", {**files(), "mine.csv": _bytes(text)})
-    for _ in other_tables(place):
+    for _ in results.other_tables(place):
         pass
 
 

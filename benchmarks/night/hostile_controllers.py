@@ -75,7 +75,6 @@ class Interrupts(Quiet):
 class InterruptsItself(Quiet):
     def strike(self):
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(5)
 
 
 class Exits(Quiet):

@@ -35,7 +35,7 @@ FIRST_SEED: Final = 100_000
 MARK: Final = "SERVOBENCH_HOSTILE_SWEEP"  # an environment variable that everything started here inherits
 SOON: Final = 5.0  # [s] until nothing is left of a command that was killed
 SMALL_FILE: Final = 4000  # [bytes] less than a part of the results: a disk that is full
-HARMLESS: Final = ("Forks", "LeavesChildren", "Prints")  # runs that complete all the same
+HARMLESS: Final = ("Forks", "InterruptsItself", "LeavesChildren", "Prints")  # runs that complete all the same
 KILLED_AT: Final = (0.25, 0.6)  # share of the runs
 
 

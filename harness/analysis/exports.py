@@ -64,7 +64,7 @@ def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[
     if kind == CSV:
         write_csv(runs, files[0])
     for row in runs.to_dict("records"):
-        if row["periods"] > 0:
+        if row.get("periods", 1) > 0:
             steps = results.load_steps(folder, [row["run_id"]])
             files.append(out / f"{row['run_id']}.{kind}")
             if kind == CSV:
@@ -122,5 +122,5 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table
     """Return a cell for JSON; None where it is not finite."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
-    number = float(value)
+    number = math.nan if value is None else float(value)
     return number if math.isfinite(number) else None

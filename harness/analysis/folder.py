@@ -1,25 +1,17 @@
-"""Describes a results folder in words, and reads its further tables."""
+"""Describes a results folder in words."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
-from pyarrow import ArrowException
 
 from servobench.controllers.aids import describe_aids
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
-from servobench.plant.contract.faults import ConfigurationError
 
-DESCRIBED: Final = {
-    "plant": "plant",
-    "sensing": "sensing",
-    "controller": "controller",
-    "task": "task",
-    "mismatch": "mismatch",
+DESCRIBED: Final = {name: name for name in ("plant", "sensing", "controller", "task", "mismatch")} | {
     "noise_factor": "noise factor",
     "latency_s": "latency [s]",
     "period_s": "period [s]",
@@ -69,33 +61,8 @@ def describe_settings(folder: Path) -> dict[str, str]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    configuration = results.read_manifest(folder).get("configuration")
-    if not isinstance(configuration, dict):
-        return {}
-    return {
-        f"{section}.{name}": _setting(value)
-        for section, values in configuration.items()
-        if isinstance(values, dict)
-        for name, value in values.items()
-    }
-
-
-def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield name and content of each further table of a folder, without runs and steps, such as answered claims.
-
-    Raises:
-        ConfigurationError: one of them cannot be read.
-    """
-    for path in sorted(folder.iterdir()):
-        own = path.name in (results.RUNS, results.STEPS) or path.name.startswith(".")
-        if own or path.suffix not in (".parquet", ".csv"):
-            continue
-        try:
-            table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
-        except (OSError, ValueError, ArrowException, OverflowError) as error:
-            why = " ".join(str(error).split())
-            raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
-        yield path.stem, table
+    sections = results.read_manifest(folder).get("configuration", {}).items()
+    return {f"{section}.{name}": _setting(value) for section, values in sections for name, value in values.items()}
 
 
 def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
@@ -113,6 +80,6 @@ def _listed(values: list[Any]) -> str:
 
 def _seeds(seeds: list[int]) -> str:
     unique = sorted(set(seeds))
-    if len(unique) > 2 and unique == list(range(unique[0], unique[-1] + 1)):
+    if len(unique) > 2 and unique[-1] - unique[0] == len(unique) - 1:
         return f"{unique[0]} to {unique[-1]} ({len(unique)})"
     return _listed(unique)

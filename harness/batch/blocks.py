@@ -11,6 +11,7 @@ costs at most the time of the runs once more. The one module that imports Dask.
 """
 
 import contextlib
+import json
 import math
 import pickle
 import re
@@ -27,11 +28,13 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+import pyarrow as pa
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import LOST, Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.tables import MAX_TIME, MOST, lacking, unfit_names
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -170,19 +173,18 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
     done, end = list[RunResult](), answer.end
     try:
         done.extend(unpack_result(job.cell, item) for job, item in zip(block.jobs, answer.items, strict=False))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
-        end = End(Ending(CRASHED, reason), certain=block.fresh and not done)
-    if end is None:
+        end = End(Ending(CRASHED, reason), certain=False)
+    if end is None or len(done) == len(block.jobs):
         return done, []
     if not done and len(block.jobs) > 1 and block.together:
         return [], block.singly()
-    single = replace(block, together=False)
-    rest = single.part(len(done), fresh=True)
-    if not end.certain and not (block.fresh and len(block.jobs) == 1):
-        return done, rest.singly() if end.alone else [rest]
-    done.append(_failed(block.jobs[len(done)].cell, end.ending))
-    return done, [single.part(len(done))] if len(done) < len(block.jobs) else []
+    single, at = replace(block, together=False), len(done)
+    rest = [single.part(at + 1)] if at + 1 < len(block.jobs) else []
+    if not end.certain and not block.fresh:  # a fresh block is one run, and its own second attempt
+        return done, [single.part(at, at + 1, fresh=True), *rest]
+    return [*done, _failed(block.jobs[at].cell, end.ending)], rest
 
 
 def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
@@ -307,18 +309,15 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
     """
     match told:
         case {
-            "row": dict(row),
-            "steps": str() | None as steps,
-            "picture": str() | None as picture,
-            "trace": str(trace),
-        }:
+            "row": dict(row), "steps": str() | None as steps, "picture": str() | None as picture, "trace": str(trace)
+        }:  # fmt: skip
             pass
         case _:
             raise ValueError("it is not the result of a run")
-    known = _failed(cell, Ending()).row
+    known, own = _failed(cell, Ending()).row, {**cell.request.as_row(), **cell.columns}
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
-    if row[RUN_ID] != known[RUN_ID]:
+    if any(json.dumps(row[name]) != json.dumps(value) for name, value in own.items() if name != "robot"):
         raise ValueError("it is that of another run")
     for name, value in row.items():
         usual = str if name in TEXTS else float
@@ -327,16 +326,28 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
             raise ValueError(  # noqa: TRY004 - the data are wrong, not the call
                 f"its {name} is {str(value)[:60]!r}, wanted a value of type {kinds[0].__name__}"
             )
-    table = None
-    if (records := _unpack_array(steps)) is not None:
-        if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
-            raise ValueError("its steps are no numbers")
-        table = pd.DataFrame.from_records(records)
-        table.insert(0, RUN_ID, row[RUN_ID])
+        if isinstance(value, int | float) and name in MOST and (value < 0 or value > MOST[name]):
+            raise ValueError(f"its {name} is {value:g}")
+    if wrong := unfit_names(row):
+        raise ValueError(f"it {wrong}")
     image = _unpack_array(picture)
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
-    return RunResult(row, table, image, trace)
+    return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
+
+
+def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:
+    if (records := _unpack_array(text)) is None:
+        return None
+    if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
+        raise ValueError("its steps are no numbers")
+    table = pd.DataFrame.from_records(records)
+    table.insert(0, RUN_ID, run_id)
+    if wrong := unfit_names(table.columns) or lacking("steps", pa.Schema.from_pandas(table)):
+        raise ValueError(f"its table of steps {wrong}")
+    if not table["time_s"].between(0.0, MAX_TIME).all():
+        raise ValueError("its steps have no times")
+    return table
 
 
 def _pack_array(array: npt.NDArray[Any] | None) -> str | None:

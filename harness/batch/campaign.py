@@ -30,13 +30,13 @@ from servobench.harness.batch.blocks import (
 )
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
 from servobench.harness.batch.lock import check_empty, is_unused, locked
-from servobench.harness.batch.manifest import describe_batch
+from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
-from servobench.harness.config.settings import Assignment, Settings
+from servobench.harness.config.settings import Assignment, Settings, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
@@ -46,12 +46,7 @@ from servobench.plant.contract.faults import ConfigurationError
 
 Row = dict[str, Any]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
-SOURCES: Final = (
-    "own_controllers",
-    "own_plants",
-    "own_tasks",
-    "plugins",
-)  # entries that have the hash of code by its name
+SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 REST: Final = "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
@@ -303,11 +298,11 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         there: manifest of the folder.
         here: manifest of the new batch.
     """
-    here = json.loads(json.dumps(here, default=str))
+    here = json.loads(results.encode(here))
     for key in NAMES:
         if there.get(key) != here[key]:
             return f"{key} {_short(there.get(key))} there, {_short(here[key])} here"
-    old, new = _flat(there.get("configuration", {})), _flat(here["configuration"])
+    old, new = flatten(there.get("configuration", {})), flatten(here["configuration"])
     for key in dict.fromkeys([*old, *new]):
         if old.get(key) != new.get(key):
             return f"{key} {_short(old.get(key, 'unknown'))} there, {_short(new.get(key, 'unknown'))} here"
@@ -329,12 +324,6 @@ def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
             if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
                 return str(record["place"])
     return ""
-
-
-def _flat(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return settings by section and key; JSON has no infinity, so a manifest has its name."""
-    every = ((f"{section}.{key}", value) for section, values in configuration.items() for key, value in values.items())
-    return {name: str(value) if value in (float("inf"), float("-inf")) else value for name, value in every}
 
 
 def _short(value: object) -> str:

@@ -1,5 +1,6 @@
 """The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,7 @@ def examine(folder: Path) -> Examination:
         remedy = "it is written anew, without traces" if name == FAILURES else "runs that are in no part are repeated"
         findings.append(Finding(name, wrong, f"{AGAIN}; {remedy}"))
     count = 0
-    for part in _parts(folder, manifest.get("campaign")):
+    for part in _parts(folder, manifest):
         names += part.names
         count += part.count
         if part.fault:
@@ -119,7 +120,7 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
     """
     sums, kept = sums_of(folder) or {}, dict[str, frozenset[str]]()
     with writing(folder):
-        for part in _parts(folder, manifest["campaign"]):
+        for part in _parts(folder, manifest):
             if part.fault:
                 yield f"{folder / part.wrong} {part.fault}: its runs are carried out again"
                 for name in reversed(part.names):  # the rows first: without them the part does not count
@@ -191,9 +192,9 @@ class _Part:
     fault: str = ""  # of that file
 
 
-def _parts(folder: Path, campaign: str | None) -> Iterator[_Part]:
-    """Yield the parts of a folder, in order; where `campaign` is not known, parts may be of any."""
-    end = 0
+def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
+    """Yield the parts of a folder, in order; where the manifest does not tell the batch, parts may be of any."""
+    campaign, end = manifest.get("campaign"), 0
     for index in results.part_indices(folder):
         names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
         names = [name for name in names if results.is_expected(folder, name)]
@@ -207,6 +208,8 @@ def _parts(folder: Path, campaign: str | None) -> Iterator[_Part]:
                 faults = [(rows, "holds the rows of other runs")]
             elif index < end:
                 faults = [(rows, "holds runs that the part before it has, too")]
+            elif index + tables.row_count(folder, rows) > manifest.get("run_count", math.inf):
+                faults = [(rows, "holds more runs than the batch has")]
         if faults:
             yield _Part(names, 0, *faults[0])
         else:

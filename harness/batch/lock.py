@@ -21,7 +21,7 @@ from typing import Final, Self
 
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import PARTIAL
+from servobench.plant.contract.files import PARTIAL, harmless
 
 LOCK = ".lock"
 PARTS: Final = "parts"
@@ -220,6 +220,8 @@ def refuse_links(folder: Path) -> None:
     while waiting:
         with contextlib.suppress(OSError), os.scandir(waiting.pop()) as inside:
             for entry in inside:
+                if harmless(entry.name) != entry.name or "\n" in entry.name:
+                    raise ConfigurationError(f"{folder} holds a file whose name cannot be printed, {entry.name!a}")
                 if entry.is_dir(follow_symlinks=False):
                     waiting.append(entry.path)
                 elif not entry.is_file(follow_symlinks=False):

@@ -74,7 +74,10 @@ def logged_in_folder(
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
         del asked["robot"]
-    varied = varied_in_row(row)
+    try:
+        varied = varied_in_row(row)
+    except ValueError as error:
+        raise ConfigurationError(f"{folder} has a varied setting that is no value: {error}") from error
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
     request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)

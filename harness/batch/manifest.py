@@ -25,13 +25,7 @@ PACKAGES = (
     "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",
     "opencv-python-headless",
 )  # fmt: skip
-
-
-OWN = {  # keys of the place and the hash of a file or an object of users, by its kind
-    "controller": "own_controllers",
-    "plant": "own_plants",
-    "task": "own_tasks",
-}
+OWN = {"controller": "own_controllers", "plant": "own_plants", "task": "own_tasks"}  # keys of code of users, by kind
 
 
 def describe_batch(

@@ -15,6 +15,8 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,10 +75,11 @@ def adopt_orphans() -> None:
     _prctl(ADOPT_ORPHANS, 1)
 
 
-def end_with(parent: int) -> None:
+def end_with_parent() -> None:
     """End this process as soon as its parent ends, which may have ended before this call."""
     _prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
-    if os.getppid() != parent:
+    parent = parent_process()
+    if parent is None or os.getppid() != parent.pid:
         os._exit(1)
 
 
@@ -124,12 +127,7 @@ def own_memory(processes: Iterable[int]) -> int:
     )
 
 
-def is_stopped(process: int | None) -> bool:
-    """Return whether a process was stopped by a signal."""
-    return bool(_ask(process, lambda each: each.status() == psutil.STATUS_STOPPED))
-
-
-def _ask(process: int | None, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer
+def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer
     """Return the answer of the system about a process; None if it has ended."""
     try:
         return question(psutil.Process(process))
@@ -158,6 +156,12 @@ def end_descendants() -> None:
         send(left, signal.SIGKILL)
         collect_ended(left)
         time.sleep(END_PAUSE)
+
+
+def wake(child: BaseProcess | None) -> None:
+    """Continue a child process in case that a signal has stopped it."""
+    if child is not None and child.pid is not None:
+        send([child.pid], signal.SIGCONT)
 
 
 def send(processes: Iterable[int], number: signal.Signals) -> None:

@@ -233,6 +233,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
     names = _intact(folder, RUNS)
     runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
+    runs = runs.astype({name: float for name in tables.MOST if name in runs and runs[name].dtype == object})
     refuse_nameless(folder / names[0], runs)
     return runs
 
@@ -276,7 +277,27 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     steps = tables.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
+    if "time_s" in steps and not steps["time_s"].between(0.0, tables.MAX_TIME).all():
+        raise ConfigurationError(f"{folder} holds steps at no time")
     return steps
+
+
+def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield name and content of each further table of a folder, without runs and steps, such as answered claims.
+
+    Raises:
+        ConfigurationError: one of them cannot be read.
+    """
+    for path in sorted(folder.iterdir()):
+        own = path.name in (RUNS, STEPS) or path.name.startswith(".")
+        if own or path.suffix not in (".parquet", ".csv"):
+            continue
+        try:
+            table = pd.read_csv(path) if path.suffix == ".csv" else tables.read_tables(folder, [path.name])
+        except (OSError, ValueError, OverflowError) as error:
+            why = error.fault if isinstance(error, DamagedFile) else " ".join(str(error).split())
+            raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
+        yield path.stem, table
 
 
 def has_steps(folder: Path) -> bool:
@@ -349,8 +370,9 @@ CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s 
 ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and that of its elements
     "created": (str,), "python": (str,), "platform": (str,), "campaign": (str,), "seeds": (str,), "run_count": (int,),
     "plants": (list, str), "controllers": (list, str), "tasks": (list, str), "mismatches": (list, str),
-    "robots": (list, dict), "configuration": (dict, dict), "own_controllers": (dict, dict), "packages": (dict,),
-    "engines": (dict,), "files": (dict, str), "side_by_side": (dict, list),
+    "robots": (list, dict), "configuration": (dict, dict), "own_controllers": (dict, dict), "own_plants": (dict, dict),
+    "own_tasks": (dict, dict), "plugins": (dict, dict), "packages": (dict,), "engines": (dict,), "files": (dict, str),
+    "side_by_side": (dict, list),
 }  # fmt: skip
 WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
 SHOWN: Final = 60  # letters of a wrong value that a message holds

@@ -14,6 +14,7 @@ import contextlib
 import faulthandler
 import gc
 import json
+import math
 import os
 import pickle
 import signal
@@ -27,7 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -39,11 +40,11 @@ from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, End
 from servobench.plant.contract.faults import ConfigurationError
 
 LOST: Final = "the run killed the process that carried it out"
-STOPPED: Final = "the run stopped the process that guards it"
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
+START_ERROR: Final = 1  # exit code of a guard that an error has kept from starting
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
@@ -75,7 +76,6 @@ class End:
 
     ending: Ending
     certain: bool  # whether its current run is the cause, and no earlier run of the same runner
-    alone: bool = False  # whether only a run with a task of its own can be certain: answers may have been lost
 
 
 @dataclass(frozen=True)
@@ -180,11 +180,12 @@ class Sandbox:
         Raises:
             ConfigurationError: no process can be started.
         """
-        answer = Answer()
+        answer, limit = Answer(), math.inf if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
+        silence = Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
         try:
             link = self._start()
             link.send_bytes(pickle.dumps(task))
-            while not (silence := self._wait(link)):
+            while self._hears(link, limit):
                 message = link.recv_bytes()
                 kind, content = message[:1], message[1:]
                 if kind == DONE:
@@ -197,7 +198,7 @@ class Sandbox:
         except (EOFError, OSError):
             silence = Ending(CRASHED, LOST)
         self.end(0.0)  # it is gone or of no use, and nothing may wait for it when this process ends
-        return Answer(answer.items, End(silence, certain=False, alone=True))
+        return Answer(answer.items, End(silence, certain=False))
 
     def ask_to_end(self) -> None:
         """Ask the guard to end the processes below it, and itself."""
@@ -218,22 +219,22 @@ class Sandbox:
             process.kill()
             process.join()
 
-    def _wait(self, link: Connection) -> Ending | None:
-        """Wait for a message; return why there will be none."""
-        limit = None if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
-        began = time.monotonic()
+    def _hears(self, link: Connection, limit: float) -> bool:
+        """Wait for a message, and return whether one came within a time [s]; a stopped guard is continued."""
+        deadline = time.monotonic() + limit
         while not link.poll(LOOK_EVERY):
-            if limit is not None and time.monotonic() - began > limit:
-                return Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
-            if self._process is not None and processes.is_stopped(self._process.pid):
-                return Ending(CRASHED, STOPPED)
-        return None
+            if time.monotonic() > deadline:
+                return False
+            processes.wake(self._process)
+        return True
 
-    def _start(self) -> Connection:
-        """Return the link to a guard that runs."""
+    def _start(self, *, again: bool = True) -> Connection:
+        """Return the link to a guard that runs; one that is ended while it starts is started once `again`."""
         if self._link is not None:
             return self._link
         context = get_context("fork") if self._copied else get_context("spawn")
+        if not self._copied:
+            resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
         ours, theirs = context.Pipe()
         inherited = (ours,) if self._copied else ()
         process: BaseProcess = context.Process(
@@ -247,25 +248,30 @@ class Sandbox:
                 process.start()
             self._process = process
         theirs.close()
-        if fault := _start_fault(ours):
+        if fault := self._start_fault(ours, process):
+            ended = process.exitcode  # before the next line ends it
             ours.close()
             self.end(0.0)
+            if again and ended not in (None, START_ERROR):
+                return self._start(again=False)
             raise ConfigurationError(fault)
         self._link = ours
         return ours
 
-
-def _start_fault(link: Connection) -> str:
-    """Wait until a guard has started and return why it has not; empty if it has."""
-    with contextlib.suppress(EOFError, OSError):
-        if not link.poll(GUARD_START):
-            return f"a worker process has not started within {GUARD_START:g} s"
-        if link.recv_bytes() == ALIVE:
-            return ""
-    return (
-        "the worker processes cannot be started; a script that starts some must keep its calls below "
-        "`if __name__ == '__main__':`"
-    )
+    def _start_fault(self, link: Connection, process: BaseProcess) -> str:
+        """Wait until a guard has started and return why it has not; empty if it has."""
+        with contextlib.suppress(EOFError, OSError):
+            if not self._hears(link, GUARD_START):
+                return f"a worker process has not started within {GUARD_START:g} s"
+            if link.recv_bytes() == ALIVE:
+                return ""
+        process.join(STOP_TIME)
+        if process.exitcode not in (None, START_ERROR):
+            return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
+        return (
+            "the worker processes cannot be started; a script that starts some must keep its calls below "
+            "`if __name__ == '__main__':`"
+        )
 
 
 def _read(content: bytes) -> Any:  # noqa: ANN401 - JSON
@@ -291,12 +297,13 @@ def _keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inheri
     for each in inherited:
         each.close()
     processes.lead_session()
-    processes.adopt_orphans()
-    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    processes.end_with_parent()  # as long as nothing is below this process
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     for name in modules:
         with contextlib.suppress(Exception):
             import_module(name)
+    processes.adopt_orphans()
+    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports
     guard = _Guard(link, limits)
     try:
@@ -343,9 +350,7 @@ class _Guard:
         self._trace.seek(0)
         self._trace.truncate()
         inherited = (self._link, self._below)
-        self._runner = context.Process(
-            target=_be_runner, args=(theirs, inherited, os.getpid(), self._limits, self._trace.fileno())
-        )
+        self._runner = context.Process(target=_be_runner, args=(theirs, inherited, self._limits, self._trace.fileno()))
         self._runner.start()
         theirs.close()
         self._owner, self._answers = task.owner, 0
@@ -355,9 +360,8 @@ class _Guard:
         """Pass the answers of the runner on until it is done; return its premature end."""
         limit = self._limits.time
         patience, since = (None if limit is None else max(limit, START_TIME)), time.monotonic()
-        limited = limit is not None or self._limits.memory is not None
         while True:
-            ready = wait([below, self._link], LOOK_EVERY if limited else None)
+            ready = wait([below, self._link], LOOK_EVERY)
             if below in ready:
                 message = below.recv_bytes(MAX_ANSWER)
                 if message[:1] == DONE:
@@ -378,7 +382,8 @@ class _Guard:
                 return end
 
     def _check_processes(self) -> End | None:
-        """Check memory and number of the processes below; end them if it is too much."""
+        """Check memory and number of the processes below; end them if it is too much, and continue a stopped runner."""
+        processes.wake(self._runner)
         below = processes.descendants(os.getpid())
         if len(below) > MAX_PROCESSES:
             return self._end(CRASHED, f"the run started more than {MAX_PROCESSES} processes")
@@ -392,7 +397,7 @@ class _Guard:
     def _find_end(self) -> End:
         """Return the end of a runner that is gone, or whose link is."""
         self._runner.join(TRACE_TIME)
-        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=not self._answers)
+        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=False)
 
     def _end(self, status: str, reason: str, *, certain: bool = True) -> End:
         """End the runner and all below it."""
@@ -420,13 +425,14 @@ class _Guard:
         processes.end_descendants()
 
 
-def _be_runner(link: Connection, inherited: Sequence[Connection], parent: int, limits: Limits, trace: int) -> None:
+def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int) -> None:
     """Be a runner: take tasks from the guard until it is gone."""
     processes.lead_session()
-    processes.end_with(parent)
+    processes.end_with_parent()
     for each in inherited:
         each.close()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, lambda *_: None)  # of somebody else; not ignored, which programs started here inherit
     signal.pthread_sigmask(signal.SIG_SETMASK, set())
     faulthandler.enable(trace, all_threads=False)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)

@@ -21,6 +21,7 @@ from servobench.plant.contract.faults import ConfigurationError
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
 MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table of any size, and for each byte of its file
+MAX_TIME: Final = 1e9  # [s] of a step, which other formats count in nanoseconds
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
@@ -146,7 +147,7 @@ def row_groups(folder: Path, name: str, columns: Sequence[str]) -> Iterator[pd.D
     with opened(folder, name) as file:
         known = [each for each in columns if each in file.schema_arrow.names]
         for group in range(file.num_row_groups):
-            yield file.read_row_group(group, known, use_threads=False).to_pandas()
+            yield file.read_row_group(group, known, use_threads=False).replace_schema_metadata().to_pandas()
 
 
 def row_count(folder: Path, name: str) -> int:
@@ -167,8 +168,8 @@ def common_schema(folder: Path, names: Sequence[str]) -> pa.Schema:
     for name in names:
         with opened(folder, name) as file:
             own = file.schema_arrow.remove_metadata()
-        if own != common:
-            common = pa.unify_schemas([common, own], promote_options="permissive")
+            if own != common:
+                common = pa.unify_schemas([common, own], promote_options="permissive")
     return common
 
 
@@ -181,13 +182,19 @@ def opened(folder: Path, name: str) -> Iterator[pq.ParquetFile]:
     """
     with reading(folder, name), pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
         names, cells = file.schema_arrow.names, file.metadata.num_rows * file.metadata.num_columns
-        if len(names) > MAX_COLUMNS:
-            raise DamagedFile(folder, name, f"has {len(names)} columns; a table has at most {MAX_COLUMNS}")
+        if wrong := unfit_names(names):
+            raise DamagedFile(folder, name, wrong)
         if cells > max(MAX_CELLS, MAX_CELLS_A_BYTE * (folder / name).stat().st_size):
             raise DamagedFile(folder, name, f"is a bomb: it unpacks to {cells:.2g} cells")
-        if len(set(names)) < len(names) or not all(each.isprintable() and len(each) <= MAX_NAME for each in names):
-            raise DamagedFile(folder, name, "has two columns of one name, or a name that cannot be printed")
         yield file
+
+
+def unfit_names(names: Collection[str]) -> str:
+    """Return why names cannot be those of columns, as a predicate of the table; empty if they can."""
+    if len(names) > MAX_COLUMNS:
+        return f"has {len(names)} columns; a table has at most {MAX_COLUMNS}"
+    fit = len(set(names)) == len(names) and all(each.isprintable() and len(each) <= MAX_NAME for each in names)
+    return "" if fit else "has two columns of one name, or a name that cannot be printed"
 
 
 @contextlib.contextmanager
@@ -217,6 +224,8 @@ TEXTS: Final = frozenset(
 NUMBERS: Final = frozenset(
     {"seed", "periods", "settling_band", *METRICS, *(short.column for short in SHORT_NAMES.values())}
 )
+WHOLE: Final = frozenset(("seed", "periods"))
+MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}  # and 0 is the least
 RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
 
@@ -231,11 +240,13 @@ def lacking(kind: str, schema: pa.Schema) -> str:
 def _mistyped(kind: str, name: str, given: pa.DataType) -> str:
     """Return that a column is of another type than it should be, as a predicate; empty if it is not."""
     is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
-    is_number = pa.types.is_integer(given) or pa.types.is_floating(given) or pa.types.is_boolean(given)
+    is_whole, is_truth = pa.types.is_integer(given), pa.types.is_boolean(given) and name not in NUMBERS
+    is_number = is_whole or is_truth or (pa.types.is_floating(given) and name not in WHOLE)
     text, number = name in TEXTS, name in NUMBERS or (kind == "steps" and name != "run_id")
     if pa.types.is_null(given) or (is_text and not number) or (is_number and not text):
         return ""
-    return f"has {given} in the column {name}, where {'texts' if text else 'numbers'} belong"
+    wanted = "texts" if text else "whole numbers" if name in WHOLE else "numbers"
+    return f"has {given} in the column {name}, where {wanted} belong"
 
 
 def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:
@@ -249,7 +260,7 @@ def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:
 
 
 def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
-    """Refuse a table of runs in which a run is not identified, or not fit for the name of a file, or a number is -inf.
+    """Refuse a table of runs in which a run is not identified, or not fit for the name of a file, or no number can be.
 
     Raises:
         ConfigurationError: names the table, the column and the row.
@@ -258,8 +269,8 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
         if (empty := runs[name].isna()).any():
             raise ConfigurationError(f"{path} is no table of runs: row {int(empty.to_numpy().argmax())} has no {name}")
     for name in NUMBERS.intersection(runs.columns):
-        if (runs[name] == -math.inf).any():
-            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number -inf")
+        if len(wrong := runs[name][(runs[name] < 0.0) | (runs[name] > MOST[name])]):
+            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number {wrong.iloc[0]:g}")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(

@@ -21,8 +21,10 @@ from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import harmless
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
+        errno.ENAMETOOLONG)  # fmt: skip
 HELP_NAMES: Final = ["-h", "--help"]
 PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
 COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
@@ -127,7 +129,7 @@ def main() -> None:
         code = INTERRUPTED
     except typer.TyperException as error:
         _end(_usage_line(error))
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, RecursionError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
@@ -159,7 +161,7 @@ def _say_where_a_signal_strikes() -> None:
 
 def _end(line: str) -> NoReturn:
     if line:
-        sys.stderr.write(f"servobench: {line}\n")
+        sys.stderr.write(f"servobench: {harmless(line)}\n")
     sys.exit(INPUT_ERROR)
 
 
@@ -185,12 +187,14 @@ def _line_of_system(error: OSError) -> str | None:
     return f"{os.strerror(error.errno)}{f' ({error.filename})' if error.filename else ''}"
 
 
-def _line_for_user(error: ValueError | ImportError) -> str | None:
+def _line_for_user(error: ValueError | ImportError | RecursionError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
 
     if isinstance(error, ImportError):
         return missing_extra(error, "this command")
+    if isinstance(error, RecursionError) and "--debug" not in sys.argv:
+        return "the input is nested too deeply"
     return str(error) if isinstance(error, ConfigurationError) else None
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NoReturn
 from rich.console import Console
 
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason
+from servobench.plant.contract.files import harmless, reason
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,10 +100,11 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
     from rich.table import Table
     from rich.text import Text
 
-    for title, rows in tables:
+    for title, given in tables:
+        rows = given.map(harmless).rename(columns=harmless)
         for number, widths in enumerate(_fit(rows, console.width)):
             table = Table(
-                title=None if number else Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False,
+                title=None if number else Text(harmless(title)), title_justify="left", box=SIMPLE_HEAD, pad_edge=False,
                 padding=(0, 1, 0, 0),
             )  # fmt: skip
             for name, width in widths.items():
@@ -157,7 +158,7 @@ def end_interrupted(kept: str, going_on: str) -> NoReturn:
 
 def say(line: str) -> None:
     """Print a line as it is, however long: it may hold names, paths and brackets of users."""
-    console.print(line, soft_wrap=True, markup=False, highlight=False)
+    console.print(harmless(line), soft_wrap=True, markup=False, highlight=False)
 
 
 def print_json(value: object) -> None:

@@ -17,7 +17,7 @@ import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
-from servobench.harness.pictures.tracks import Track, track_of
+from servobench.harness.pictures.tracks import Track, track_of, values_drawn
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -209,7 +209,7 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
         model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
     if mismatch.size("camera_turn") > 0.0:
         raise ConfigurationError(f"run {row['run_id']} cannot be shown: films have no camera that turns")
-    logged, drawn = json.loads(row.get("mismatch_values") or "{}"), json.loads(json.dumps(sample.as_record()))
+    logged, drawn = values_drawn(row), json.loads(json.dumps(sample.as_record()))
     if any(logged.get(name) != value for name, value in drawn.items()):
         raise ConfigurationError(
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "

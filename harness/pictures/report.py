@@ -19,7 +19,7 @@ from markupsafe import Markup, escape
 
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import comparison, tables
-from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, other_tables
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
@@ -134,7 +134,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         views=views,
         runs=runs,
         numbered=numbered,
-        others=list(other_tables(folder)),
+        others=list(results.other_tables(folder)),
         facts=facts,
         settings=describe_settings(folder),
         data=_data(folder, shown, views),
@@ -338,7 +338,7 @@ def cell(value: Any) -> Cell:  # noqa: ANN401 - a cell of any table
 
 def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
     """Return a value as a reader wants it: no name of Python's for nothing, infinity or truth."""
-    if isinstance(value, list | tuple | set | dict):
+    if isinstance(value, list | tuple | set | dict | np.ndarray):
         return str(value)
     if pd.isna(value):
         return MISSING

@@ -14,7 +14,7 @@ from typing import Any, Self, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, texts_of, with_places
+from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, with_places
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -178,6 +178,18 @@ def _load_tracks(folder: Path, runs: pd.DataFrame, columns: Collection[str] | No
             yield Track({str(key): value for key, value in row.items()}, tables[row["run_id"]])
 
 
+def values_drawn(row: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return the values of a run's mismatch that were drawn, from its row in the table of runs.
+
+    Raises:
+        ConfigurationError: the row has something else.
+    """
+    try:
+        return dict(json.loads(row.get("mismatch_values") or "{}"))
+    except (ValueError, TypeError) as error:
+        raise ConfigurationError(f"run {row['run_id']} has mismatch_values that are none: {error}") from error
+
+
 def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
     """Return the tracks as `Track.overview`, `Track.closing` or `Track.for_path` make them."""
     return {name: kind(track) for name, track in tracks.items()}
@@ -254,8 +266,8 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
 
 def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     """Return the ensembles of runs of one plant and mismatch with steps, task -> controller -> ensemble."""
-    run = results.read_manifest(folder).get("configuration", {}).get("run", {})
-    share = float(run.get("camera_moves_at", math.nan))
+    share = results.read_manifest(folder).get("configuration", {}).get("run", {}).get("camera_moves_at")
+    share = share if isinstance(share, int | float) and 0.0 <= share < 1.0 else math.nan
     tracks: dict[str, dict[str, list[Track]]] = {}
     for track in _load_tracks(folder, runs, COLUMNS):
         tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
@@ -275,7 +287,7 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
 def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
     """Return the ensemble of tracks; a camera moves after that share of a run."""
     runs, longest = pd.DataFrame([track.row for track in tracks]), max(tracks, key=lambda track: len(track.table))
-    moves = any(json.loads(text).get("move_angle", 0.0) != 0.0 for text in texts_of(runs, "mismatch_values").dropna())
+    moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
     known = moves and not math.isnan(camera_moves_at)
     moved_at = float(longest.time[int(camera_moves_at * len(longest.time))]) if known else math.nan
     few = [track.thinned(len(longest.table) // OVERVIEW if longest.long else 1) for track in tracks]

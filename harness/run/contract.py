@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import REAL, FloatArray
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
 
 PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
-MAX_NAMES: Final = 256  # of diagnostics in a run: each is a column
+MAX_NAMES, MAX_LETTERS = 256, 100  # of diagnostics in a run, each of which is a column, and of one of their names
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
@@ -74,8 +74,9 @@ class HeldController(Controller):
         for name, value in given.items():
             if type(value) not in PLAIN and not _is_number(value):
                 raise WrongAnswer(f"diagnostics must hold numbers, got {name!r}: {_kind(value)}", method)
-            if not isinstance(name, str):
-                raise WrongAnswer(f"diagnostics must have texts as names, got {name!r}", method)
+            if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_LETTERS:
+                text = f"diagnostics must have texts of one line and at most {MAX_LETTERS} letters as names, got"
+                raise WrongAnswer(f"{text} {name!r:.{MAX_LETTERS}}", method)
         self._names.update(given)
         if len(self._names) > MAX_NAMES:
             text = f"diagnostics must keep to the same names, at most {MAX_NAMES}: each is a column; got"

@@ -16,7 +16,7 @@ from typing import Final
 from servobench.plant.contract.files import partial_path, sync, write_atomically
 
 SUMS: Final = "SHA256SUMS"
-LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>\S.*)")
+LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>(?!/|(.*/)?\.\.?(/|$))\S[^\0]*)")  # within the folder
 TABLE_END: Final = b"PAR1"  # the last bytes of a Parquet file
 
 Sums = Mapping[str, frozenset[str]]  # the digests that a file may have, by its name within the folder

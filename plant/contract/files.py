@@ -15,6 +15,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
+CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -114,6 +115,11 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
         came = "nothing, or nan" if cell == "nan" else repr(cell)
         raise ConfigurationError(f"{what}, row {row}: {names[column]} must be a finite number, got {came}")
     return np.asarray(values)
+
+
+def harmless(text: str) -> str:
+    """Return a text in which signs that a terminal obeys, or cannot print, are written by their number."""
+    return CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def reason(error: Exception) -> str:

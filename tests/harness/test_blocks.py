@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 from concurrent.futures import Future
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ import pytest
 
 from kit.command import judged
 from servobench.harness.batch import blocks, results
-from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.sandbox import Answer, End, Workers
@@ -90,8 +90,11 @@ class Struck(Exception):
     """Ends a task in the middle of a run."""
 
 
-def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
-    """Return workers that lose each task at the run of one seed, and note how many runs tasks have."""
+def dying_workers(how: Exception | End, sizes: list[int], *, guard: bool = False) -> Workers:
+    """Return workers that lose each task at the run of one seed, and note how many runs tasks have.
+
+    Where the guard is lost, the last answer is lost with it.
+    """
 
     def submit(task):
         block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
@@ -114,11 +117,7 @@ def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
             if not block.together:
                 with contextlib.suppress(Struck):
                     task.carry_out(tell)
-            if how.alone:  # the last answer is lost with the guard
-                future.set_result(Answer(items[:-1], how))
-            else:
-                end = replace(how, certain=how.certain or (task.fresh and not items))
-                future.set_result(Answer(items, end))
+            future.set_result(Answer(items[:-1] if guard else items, how))
         return future
 
     return Workers(submit, 2, lost=(ProcessDied,))
@@ -151,7 +150,7 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
     alone, tmp_path, monkeypatch, certain, guard, again
 ):
     sizes: list[int] = []
-    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain, guard), sizes))
+    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain), sizes, guard=guard))
     monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
     carry_out(CAMPAIGN, tmp_path / "out", Execution(2, block=1))
     runs = results.load_runs(tmp_path / "out")
@@ -160,6 +159,25 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
     assert set(runs["reason"][lost]) == {"it died"}
     pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
     assert sum(sizes) <= len(runs) + 8 * 4 + again * 4
+
+
+@pytest.mark.parametrize("answers", [0, 1, 3])
+def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer_are_carried_out_again(answers):
+    sizes: list[int] = []
+
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
+        told = [blocks.pack_result(RunResult.failed(identity(each.cell.request), Ending())) for each in block.jobs]
+        sizes.append(len(block.jobs))
+        future = Future()
+        end = End(Ending("crashed", "SIGTERM"), certain=False) if len(sizes) == 1 else None
+        future.set_result(Answer(told[:answers] if end else told, end))
+        return future
+
+    outcomes = list(carry_out_blocks([Block(tuple(job(index, None) for index in range(3)))], Workers(submit)))
+    assert sorted(result.row["seed"] for _, found in outcomes for result in found) == [0, 1, 2]
+    assert all(result.row["status"] == "completed" for _, found in outcomes for result in found)
+    assert sizes == [size for size in (3, answers < 3, 2 - answers) if size > 0]
 
 
 def job(index: int, kind: object) -> Job:
@@ -235,6 +253,10 @@ def told(**changes: object) -> dict[str, object]:
     return {"row": row, "steps": None, "picture": None, "trace": ""} | changes
 
 
+def steps_of(**values: object) -> str | None:
+    return blocks._pack_array(pd.DataFrame(values, index=[0]).to_records(index=False))
+
+
 @pytest.mark.parametrize(
     ("answer", "why"),
     [
@@ -243,10 +265,23 @@ def told(**changes: object) -> dict[str, object]:
         (told(steps=[1]), "it is not the result of a run"),
         (told(row={}), "it lacks controller"),
         (told(row=told()["row"] | {"run_id": "../../escaped"}), "it is that of another run"),
+        (told(row=told()["row"] | {"controller": "rls"}), "it is that of another run"),
         (told(row=told()["row"] | {"status": 3}), "its status is '3', wanted a value of type str"),
         (told(row=told()["row"] | {"rms_error": "small"}), "its rms_error is 'small', wanted a value of type float"),
+        (told(row=told()["row"] | {"controller_time_p99_us": -math.inf}), "its controller_time_p99_us is -inf"),
+        (told(row=told()["row"] | {"saturation_fraction": 1.5}), "its saturation_fraction is 1.5"),
+        (
+            told(row=told()["row"] | {"two\nlines": 1.0}),
+            "it has two columns of one name, or a name that cannot be printed",
+        ),
         (told(steps="AAAA"), "reading magic string"),
         (told(steps=blocks._pack_array(np.array([("a",)], dtype=[("x", "U1")]))), "its steps are no numbers"),
+        (told(steps=steps_of(time_s=0.0)), "its table of steps lacks the column error_norm"),
+        (told(steps=steps_of(time_s=math.nan, error_norm=0.0)), "its steps have no times"),
+        (
+            told(steps=steps_of(time_s=0.0, error_norm=0.0, **{"a\x1b": 0.0})),
+            "its table of steps has two columns of one",
+        ),
         (told(picture=blocks._pack_array(np.zeros((2, 2)))), "its picture is no image"),
     ],
 )
@@ -256,7 +291,8 @@ def test_an_answer_that_was_falsified_is_refused(answer, why):
 
 
 def test_a_result_is_the_same_after_its_way_through_a_process():
-    steps = pd.DataFrame({"run_id": "a", "step": np.arange(3), "value": [0.1, np.nan, np.inf], "valid": [True] * 3})
+    numbers = {"step": np.arange(3), "time_s": 0.1 * np.arange(3), "error_norm": [0.1, np.nan, np.inf]}
+    steps = pd.DataFrame({"run_id": "a", **numbers, "valid": [True] * 3})
     row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row | {"rms_error": np.nan}
     steps["run_id"] = row["run_id"]
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)

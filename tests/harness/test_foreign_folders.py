@@ -8,12 +8,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import matplotlib.font_manager  # noqa: F401 - fills its cache before anything is noted
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet
 import pytest
 
 from kit.command import servobench
@@ -30,7 +32,7 @@ WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 TARGETS = {"os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}  # arguments that are written, by event
 TARGETS |= dict.fromkeys(("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod", "shutil.rmtree"), (0,))
 RELATIVE = ("os.mkdir", "os.remove", "os.rmdir", "os.rename")
-OWN_PROGRAMS = ("git", "fc-list")  # which servobench and matplotlib start
+OWN_PROGRAMS = ("git", "fc-list", "uname")  # which servobench, matplotlib and the platform module start
 PROGRAMS = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen")
 _notes: list[list[tuple[str, str]]] = []  # the list of the moment: a hook cannot be taken away
 
@@ -171,6 +173,10 @@ WRONG = {
         lambda runs: runs.assign(overshoot=-np.inf),
         "the column overshoot has the number -inf",
     ),
+    "a time below 0": (lambda runs: runs.assign(settling_time_s=-1.0), "the column settling_time_s has the number -1"),
+    "a share above 1": (lambda runs: runs.assign(saturation_fraction=2.0), "saturation_fraction has the number 2"),
+    "truths for numbers": (lambda runs: runs.assign(rms_error=True), "has bool in the column rms_error, where numbers"),
+    "half seeds": (lambda runs: runs.assign(seed=0.5), "has double in the column seed, where whole numbers belong"),
     "a run twice": (lambda runs: pd.concat([runs, runs, runs.assign(controller="b")]), "constant has several runs of"),
     "names of two lines": (lambda runs: runs.assign(**{"a\nb": 1}), "a name that cannot be printed"),
     "too many columns": (
@@ -192,6 +198,113 @@ def test_a_table_of_wrong_columns_is_one_line(kind, tmp_path, monkeypatch, capsy
         error = capsys.readouterr().err
         assert re.search(words, error), error
         assert error.count("\n") == 1
+
+
+def rewritten(name: str, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Callable[[Path], object]:
+    """Return what changes a table of a folder, with a checksum that fits."""
+    return lambda folder: write_vouched(folder, {name: change(pd.read_parquet(folder / name)).to_parquet})
+
+
+def manifest(**values: object) -> Callable[[Path], object]:
+    return lambda folder: results.write_manifest(folder, results.read_manifest(folder) | values)
+
+
+def lists_in_lists(folder: Path) -> None:
+    manifest(configuration={"run": {"period": "deep"}})(folder)
+    text = (folder / results.MANIFEST).read_text().replace('"deep"', "[" * 900 + "]" * 900)
+    write_vouched(folder, {results.MANIFEST: lambda file: file.write_text(text)})
+
+
+def part_behind_the_last_run(folder: Path) -> None:
+    """Put a part behind the last run of the batch."""
+    (folder / results.PARTS).mkdir()
+    for name in (results.RUNS, results.STEPS):
+        content = (folder / name).read_bytes()
+        write_vouched(
+            folder, {results.part_name(99_999_999, name): lambda file, content=content: file.write_bytes(content)}
+        )
+        (folder / name).unlink()
+    manifest(run_count=2)(folder)
+
+
+def hostile_metadata(folder: Path) -> None:
+    """Tell pandas about columns that there are not, in a table without a checksum."""
+    words = {b"pandas": b'{"index_columns": ["none"], "columns": [], "column_indexes": [{}]}'}
+    table = pa.parquet.read_table(folder / results.RUNS).replace_schema_metadata(words)
+    pa.parquet.write_table(table, folder / results.RUNS)
+    (folder / SUMS).unlink()
+
+
+def differing_parts(folder: Path) -> None:
+    (folder / results.PARTS).mkdir()
+    for index, value in enumerate((0.5, True)):
+        run = row() | {"run_id": f"b{index}"}
+        results.write_part(folder, index, [RunResult(run, made_up_steps(f"b{index}").assign(jacobian_error=value))])
+    for name in (results.RUNS, results.STEPS):
+        (folder / name).unlink()
+
+
+def table_beside(table: pa.Table) -> Callable[[Path], object]:
+    return lambda folder: pa.parquet.write_table(table, folder / "more.parquet")
+
+
+runs, steps = partial(rewritten, results.RUNS), partial(rewritten, results.STEPS)
+FIGURE = "figures {} --kind errors --format svg"
+EXPORT, MCAP = "export {} --out out", "export {} --out out --format mcap"
+ODD = {  # what a folder holds: the command, its exit code, and words of its one line
+    "a seed far from the others": (runs(lambda old: old.assign(seed=[0, 1, 2**40])), "report {}", 0, ""),
+    "no settling band": (runs(lambda old: old.assign(settling_band=None)), "report {}", 0, ""),
+    "values that are none": (runs(lambda old: old.assign(mismatch_values="[1")), FIGURE, 2, "that are none"),
+    "a setting that is none": (
+        runs(lambda old: old.assign(**{"plant.lag": "[1"})), f"shadow {{}} --run {RUN}", 2, "that is no value",
+    ),
+    "no number of periods": (runs(lambda old: old.drop(columns="periods")), EXPORT, 0, ""),
+    "a name too long for a file": (runs(lambda old: old.assign(run_id="x" * 300, periods=0)), EXPORT, 0, ""),
+    "steps at no time": (steps(lambda old: old.assign(time_s=np.nan)), MCAP, 2, "steps at no time"),
+    "steps without a number": (steps(lambda old: old.assign(jacobian_error=None)), MCAP, 0, ""),
+    "columns of several types": (differing_parts, "collect {}", 2, "Unable to merge"),
+    "a part behind the last run": (part_behind_the_last_run, "verify {}", 1, "holds more runs than the batch has"),
+    "a camera that moves at a word": (manifest(configuration={"run": {"camera_moves_at": "noon"}}), FIGURE, 0, ""),
+    "lists in lists": (lists_in_lists, "report {}", 2, "nested too deeply"),
+    "code that is a list": (manifest(plugins=[1]), "statistics {}", 2, "plugins must be an object of an object"),
+    "words for pandas": (hostile_metadata, "verify {}", 1, "nothing vouches"),
+    "a table beside that is a bomb": (table_beside(BOMB), "report {}", 2, "it unpacks to 3e+07 cells"),
+    "a table beside with lists": (table_beside(pa.table({"a": [[1, 2], [3]]})), "report {}", 0, ""),
+    "a name of two lines": (lambda folder: (folder / "a\nb").touch(), "statistics {}", 2, r"be printed, 'a\nb'"),
+    "a name that is no text": (lambda folder: (folder / "\udcff").touch(), "statistics {}", 2, "cannot be printed"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_an_odd_folder_is_read_or_refused_in_one_line(kind, tmp_path, monkeypatch, capsys):
+    make, command, code, words = ODD[kind]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])  # which take seconds
+    make(comparison(tmp_path / "folder", ("constant",), ("exp1", "exp2", "circle")[: 1 + 2 * ("seed" in kind)]))
+    assert servobench(monkeypatch, *command.format("folder").split()) == code, capsys.readouterr()
+    said = capsys.readouterr()
+    assert words in said.out + said.err
+    assert said.err.count("\n") <= 1
+
+
+def test_checksums_of_files_elsewhere_are_not_looked_at(tmp_path, monkeypatch, capsys):
+    folder = signed(tmp_path / "folder")
+    with (folder / SUMS).open("a") as sums:
+        sums.writelines(
+            f"{'0' * 64}  {name}\n" for name in ("/dev/zero", "../victim", "parts/../../victim", "a\0b", "..")
+        )
+    assert servobench(monkeypatch, "verify", str(folder)) == 0
+    assert "3 files are as they were written" in capsys.readouterr().out
+
+
+def test_a_terminal_obeys_no_word_of_a_folder(tmp_path, monkeypatch, capsys):
+    rows = [made_up_row(f"{RUN}-{seed}", controller="a\x1b]0;b\x07\u202ec", seed=seed) for seed in range(2)]
+    write_folder(tmp_path / "folder", rows, [])
+    for form in ((), ("--markdown",), ("--json",), ("--latex",)):
+        assert servobench(monkeypatch, "statistics", str(tmp_path / "folder"), *form) == 0
+        said = capsys.readouterr().out
+        assert files.harmless(said) == said
+        assert "]0;b" in said
 
 
 def test_controllers_that_share_no_seed_are_no_pair(tmp_path, monkeypatch, capsys):

@@ -1,13 +1,15 @@
-"""Sandboxes: calls with their answers, guards that do not start, and guards that are stopped."""
+"""Sandboxes: calls with their answers, guards that do not start or are ended meanwhile, and guards that are stopped."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -35,7 +37,67 @@ def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_woul
     assert set(multiprocessing.active_children()) == before
 
 
-STOPPED = """
+ONCE = """
+import os, pathlib, signal
+
+first = pathlib.Path(__file__).with_name("first")
+if not first.exists() or {always}:
+    first.touch()
+    os.kill(os.getpid(), signal.{name})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"])
+def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(name, tmp_path, monkeypatch):
+    (tmp_path / "ends_once.py").write_text(ONCE.format(name=name, always=False))
+    monkeypatch.syspath_prepend(tmp_path)
+    workers = Pool(1, Limits(), ("ends_once",))
+    try:
+        assert workers.submit(Task(harm, pickle.dumps("return"))).result(300.0).items == [["begins", "return"]]
+    finally:
+        workers.stop()
+
+
+@pytest.mark.slow
+def test_of_a_guard_that_is_ended_whenever_it_starts_the_signal_is_named(tmp_path, monkeypatch):
+    (tmp_path / "ends_always.py").write_text(ONCE.format(name="SIGKILL", always=True))
+    monkeypatch.syspath_prepend(tmp_path)
+    workers = Pool(1, Limits(), ("ends_always",))
+    try:
+        with pytest.raises(ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"):
+            workers.submit(Task(harm, pickle.dumps("return"))).result(300.0)
+    finally:
+        workers.stop()
+
+
+UNTOUCHED = """
+import os, pickle, signal
+from servobench.harness.batch.processes import Limits
+from servobench.harness.batch.sandbox import Pool, Task
+
+def blocked(_, tell):
+    tell([int(line.split()[1], 16) for line in open(f"/proc/{os.getppid()}/status") if line.startswith("SigBlk")])
+
+if __name__ == "__main__":
+    pool = Pool(1, Limits(), ())
+    ((mask,),) = pool.submit(Task(blocked, pickle.dumps(None))).result(300.0).items
+    pool.stop()
+    print(bool(mask & 1 << signal.SIGINT - 1))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the signals that a process blocks are read from /proc")
+def test_ctrl_c_does_not_reach_the_first_guard_while_it_starts(tmp_path):
+    (tmp_path / "starts.py").write_text(UNTOUCHED)
+    path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
+    done = subprocess.run([sys.executable, str(tmp_path / "starts.py")], capture_output=True, text=True, env=path,
+                          check=False, timeout=120)  # fmt: skip
+    assert done.stdout == "True\n", done.stderr
+
+
+KILLED = """
 import os, pickle, signal, time
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits
@@ -46,28 +108,51 @@ def hold(seconds, tell):
     time.sleep(seconds)
 
 if __name__ == "__main__":
-    pool = Pool(1, Limits(time=600.0), ())
+    starts = {starts}
+    pool = Pool(1, Limits(time=600.0), ["imported"] * starts)
     pool.submit(Task(hold, pickle.dumps(600)))
-    while len(below := processes.descendants(os.getpid())) < 3:  # resource tracker, guard and runner
+    while len(below := processes.descendants(os.getpid())) < 3 - starts:  # resource tracker, guard and runner
         time.sleep(0.05)
-    (guard,) = (each for each in below if processes.descendants(each))
+    while starts and not os.path.exists("begun"):
+        time.sleep(0.05)
     print(*below, flush=True)
-    os.kill(guard, signal.SIGSTOP)
+    for guard in below:
+        if processes.descendants(guard):
+            os.kill(guard, signal.SIGSTOP)
     os.kill(os.getpid(), signal.SIGKILL)
 """
+SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
 
 
 @pytest.mark.slow
-def test_a_guard_that_is_stopped_ends_with_the_process_that_started_it(tmp_path):
-    (tmp_path / "killed.py").write_text(STOPPED)
+@pytest.mark.parametrize("starts", [False, True])
+def test_a_guard_that_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
+    (tmp_path / "killed.py").write_text(KILLED.format(starts=starts))
+    (tmp_path / "imported.py").write_text(SLOW)
     path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
-    done = subprocess.run([sys.executable, str(tmp_path / "killed.py")], capture_output=True, text=True, env=path,
-                          check=False, timeout=120)  # fmt: skip
+    done = subprocess.run([sys.executable, "killed.py"], capture_output=True, text=True, env=path, check=False,
+                          timeout=120, cwd=tmp_path)  # fmt: skip
     assert done.returncode == -signal.SIGKILL, done.stderr
     below, deadline = [int(word) for word in done.stdout.split()], time.monotonic() + 5.0
     while left := [each for each in below if psutil.pid_exists(each) and psutil.Process(each).status() != "zombie"]:
         assert time.monotonic() < deadline, left
         time.sleep(0.05)
+
+
+def wait_for_file(path: Path, tell) -> None:
+    tell(os.getpid())
+    while not path.exists():
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGSTOP", "SIGINT"])
+def test_a_runner_that_somebody_stops_or_interrupts_goes_on(name, tmp_path):
+    def disturb(runner: object) -> None:
+        os.kill(runner, signal.Signals[name])
+        (tmp_path / "file").touch()
+
+    assert sandbox.call(wait_for_file, tmp_path / "file", Limits(time=30.0), disturb) is None
 
 
 def harm(how: str, tell) -> None:
@@ -88,7 +173,7 @@ def harm(how: str, tell) -> None:
         ("return", None),
         ("exit", ("crashed", "the run killed the process that carried it out: exit code 3")),
         ("hang", ("timed_out", "the run took longer than 3 s")),
-        ("stop", ("crashed", "the run stopped the process that guards it")),
+        ("stop", ("timed_out", "the run took longer than 3 s")),
     ],
 )
 def test_a_call_returns_how_its_function_ended(how, end):
