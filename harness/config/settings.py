@@ -153,8 +153,9 @@ def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
     path = [mapped[1], *mapped[2].strip().split(".")] if mapped else key.strip().split(".")
     if not equals or len(path) < 2 or not all(path):
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
+    bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""  # three numbers or more, without brackets
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = tomllib.loads(f"value = [{text}]" if bare else f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text.strip()  # a bare word is a string
     target = sections

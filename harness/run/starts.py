@@ -82,18 +82,18 @@ def draw_in_view(
         ValueError: too few postures are fit.
     """
     least = box.shortest * nominal.noise_unit  # the same way in the image, however near the camera is
-    found: list[FloatArray] = []
+    found, features = np.empty((MAX_DRAWS, robot.n)), np.empty((MAX_DRAWS, len(nominal.channel.names)))
+    count = 0
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
         drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, robot.n))
         for posture in drawn[_fit(drawn, box, robot, nominal, true)]:
-            for other in found:
-                if norm(nominal.feature(posture) - nominal.feature(other)) >= least:
-                    return other, posture
-            found.append(posture)
-    raise ValueError(
-        f"{len(found)} of {MAX_DRAWS} postures in the box keep the target in view, and no two of them are far enough "
-        "apart"
-    )
+            found[count], features[count] = posture, nominal.feature(posture)
+            far = norm(features[count] - features[:count]) >= least
+            if far.any():
+                return found[far.argmax()], posture
+            count += 1
+    kept = f"{count} of {MAX_DRAWS} postures between lower and upper are in view and above lowest = {box.lowest:g} m"
+    raise ValueError(f"{kept}, and no two of these are shortest = {box.shortest:g} m apart")
 
 
 def drawn_together(
@@ -111,7 +111,9 @@ def drawn_together(
         both = home + 0.1 * tenths * (np.stack([start, target]) - home)
         if _in_view(both, nominal, true).all():
             return (start, target) if tenths == 10 else (both[0], both[1])
-    raise ValueError("start and target must be in view, and near the arm's home they are not; use another mismatch")
+    own = robot.camera
+    remedy = f"look at [pose] in {own.name}, whose z axis is the optical axis" if own else "use another mismatch"
+    raise ValueError(f"start and target must be in view, and near the arm's home they are not; {remedy}")
 
 
 def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:

@@ -133,7 +133,8 @@ class RandomTask(Task):
                 point = true.feature(target)
                 if _stays_in_reach(point, self.lowest, setting, robot):
                     return setting.move(start, FixedPoint(point), self.duration)
-        raise ValueError("no start and target in the box are far enough apart and above the table")
+        least = f"apart by shortest = {self.shortest:g} m and above the table by lowest = {self.lowest:g} m"
+        raise ValueError(f"no start and target between lower and upper are {least}; lessen these, or widen the box")
 
     def scaled(self, name: str, work: Workspace) -> Self:
         """See `Task.scaled`."""

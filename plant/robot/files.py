@@ -257,7 +257,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
     finally:
         log.removeFilter(collect)
     if said:
-        raise ValueError(f"robot file {path} is no URDF that can be read: {' '.join(said[0].split())}")
+        raise ValueError(f"robot file {path} is no URDF, with a <robot> as its root: {' '.join(said[0].split())}")
     return read
 
 
@@ -268,6 +268,9 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
     for joint in tree.joints:
         if lost := {joint.parent, joint.child} - set(links):
             raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(map(str, lost))!r}")
+    roots = sorted({joint.parent for joint in tree.joints} - set(above))
+    if len(roots) > 1:
+        raise ValueError(f"both {' and '.join(roots)} are without a parent: a joint is missing or turned round")
     if tip and tip not in links:
         raise ValueError(f"it has no link {tip!r}; valid: {', '.join(links)}")
     ways = {name: _way(name, above) for name in links}

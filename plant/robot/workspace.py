@@ -282,14 +282,21 @@ def find_workspace(
     Raises:
         ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
     """
+    if arm.n < 3 or length_scale(arm) == 0.0:
+        size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
+        raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
     found = [_at_height(arm, limits, shapes, height) for height in HEIGHTS[:1]]
     for height in HEIGHTS[1:]:
         if found[-1] is None or found[-1][0] < ENOUGH * 0.8:
             found.append(_at_height(arm, limits, shapes, height))
     fit = [each for each in found if each is not None]
     if not fit:
+        look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+        if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
+            look = "its joint limits, which forbid all of them"
         raise ValueError(
-            "the arm has no posture in which its ball is over the table, in view of the camera and free of contact"
+            "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
+            f"look at {look}"
         )
     return max(fit, key=lambda each: each[0])[1]
 

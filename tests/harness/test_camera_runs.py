@@ -14,6 +14,7 @@ from kit.lanes import assert_rows_of_single_runs
 from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.replay import logged_run
+from servobench.harness.run import starts
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, draw
 from servobench.harness.run.request import RunRequest
@@ -38,6 +39,8 @@ WORD = "ur10e with mine.toml"
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(CAMERA + ON_FLANGE)
+    aside = CAMERA.replace("615.0", "500.0") + '[pose]\nframe = "base"\nposition = [0.0, 0.5, 1.55]\n'
+    Path("aside.toml").write_text(aside + "rotation = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]\n")
     Path("planned.toml").write_text(CAMERA.replace('noise = "0.5px"', ""))
 
 
@@ -122,6 +125,10 @@ def test_a_challenge_has_the_camera_of_a_file_beside_it(tmp_path):
         (("--sensing", "pixel"), "camera mine.toml is on the flange; use --sensing pixel:hand"),
         (("--sensing", "stereo:hand"), "sensing stereo has 2 cameras, and mine.toml describes 1"),
         (("--sensing", "position:hand"), "sensing.feature_noise is 0.5px, but the features are in m"),
+        (
+            ("--camera", "aside.toml", "--sensing", "pixel", "--task", "exp2"),
+            "look at [pose] in aside.toml, whose z axis is",
+        ),
         (("--camera", "none.toml"), "camera file none.toml cannot be read: No such file or directory"),
     ],
 )
@@ -129,6 +136,12 @@ def test_what_does_not_fit_is_one_line(monkeypatch, capsys, command, said):
     arguments = ["run", "constant", "--plant", "kinematic", "--camera", "mine.toml", *command, "--out", "out"]
     assert servobench(monkeypatch, *arguments) == 2
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_distance_that_no_two_targets_in_view_have_is_one_line(monkeypatch):
+    monkeypatch.setattr(starts, "MAX_DRAWS", 512)
+    with pytest.raises(ConfigurationError, match=r"of 512 postures .* no two of these are shortest = 100 m apart"):
+        run_experiment(request(), Settings({"random": {"shortest": 100.0}}))
 
 
 def test_a_plant_with_a_camera_of_its_own_refuses_it():

@@ -93,6 +93,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--config", "no_section.toml"), "'lag' stands outside a [section]"),
     # targets
     ((*RUN, "--task", "target", "--set", "target.target=[9,9,9]"), "(9, 9, 9) m in the camera frame, is"),
+    ((*RUN, "--task", "target", "--set", "target.target=9,9,9"), "(9, 9, 9) m in the camera frame, is"),
+    ((*RUN, "--task", "random", "--set", "random.shortest=100"), "apart by shortest = 100 m and above the table"),
     ((*RUN, "--task", "target", "--set", "target.target=[1,2]"), "target must have shape (3,), got (2,)"),
     ((*RUN, "--task", "circle", "--set", "circle.radius=30"), "m out of the arm's reach; for a target out of reach"),
     ((*RUN, "--task", "line", "--set", "line.end=[200,100,1200]"), "a point of its curve, (200, 100, 1200) m"),

@@ -94,8 +94,13 @@ def test_a_workspace_is_found_again_bit_for_bit():
 def test_an_arm_that_cannot_reach_its_bench_is_refused():
     robot = find_robot("panda")
     pinned = replace(robot.limits, lower=np.full(7, -0.01), upper=np.full(7, 0.01))
-    with pytest.raises(ValueError, match="no posture in which its ball is over the table"):
+    with pytest.raises(ValueError, match="no posture in which its ball is over the table.*look at its joint limits"):
         found(replace(robot, limits=pinned))
+    planar = replace(robot.arm, rpy=np.zeros_like(robot.arm.rpy))
+    with pytest.raises(ValueError, match="no posture .* look at order, units and signs of its lengths and twists"):
+        found(replace(robot, arm=planar))
+    with pytest.raises(ValueError, match=r"three joints or more and links with lengths, got 7 joints and links of 0 m"):
+        found(replace(robot, arm=replace(robot.arm, translation=np.zeros_like(robot.arm.translation))))
 
 
 def test_the_distance_of_segments_is_that_of_the_nearest_of_many_points():
@@ -248,9 +253,21 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
 def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path, caplog, text):
     pytest.importorskip("yourdfpy")
     (tmp_path / "arm.urdf").write_text(text)
-    with pytest.raises(ValueError, match=r"arm\.urdf is no URDF that can be read: .*line \d+, column \d+"):
+    with pytest.raises(ValueError, match=r"arm\.urdf is no URDF, with a <robot> .*line \d+, column \d+"):
         find_robot(str(tmp_path / "arm.urdf"))
     assert caplog.records == []
+
+
+def test_a_urdf_of_two_trees_is_refused(tmp_path):
+    pytest.importorskip("yourdfpy")
+    turned = odd_urdf().replace(
+        '<parent link="link_3"/><child link="link_4"/>', '<parent link="link_4"/><child link="link_3"/>'
+    )
+    (tmp_path / "arm.urdf").write_text(turned)
+    with pytest.raises(
+        ValueError, match="both foot and link_4 are without a parent: a joint is missing or turned round"
+    ):
+        find_robot(str(tmp_path / "arm.urdf"))
 
 
 def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
