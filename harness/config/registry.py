@@ -222,7 +222,7 @@ def _made_controller(name: str) -> ControllerEntry | None:
         raise ValueError(f"controller {name!r}: {error}") from error
 
 
-PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant)
+PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=(".fmu", ".toml"))
 CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
     CONTROLLER,
     "servobench.controllers",

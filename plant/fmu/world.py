@@ -415,6 +415,11 @@ def fmu_entry(path: Path) -> PlantEntry:
     Raises:
         ValueError: the mapping cannot be used.
     """
+    if path.suffix == ".fmu":
+        wanted = (
+            f"a mapping (TOML) with file, inputs and features, of the variables that servobench fmu info {path} lists"
+        )
+        raise ValueError(f"plant {path} needs {wanted}")
     mapping = read_mapping(path)
 
     def build(config: FmuConfig, setup: PlantSetup) -> Bench:
