@@ -41,7 +41,6 @@ from servobench.plant.contract.signals import BoolArray, Observation
 MAX_GAP = 16  # longest motion over lost frames from which is learned, in motions of the least length
 MIN_CHANGE_RATIO = 0.8  # [1] of a motion's change between candidates to noise, above which delays differ
 MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
-NIS_CAP = 50.0  # [1] of ‖ν‖²/s', the normalised innovation squared (NIS), of one motion in the score of a delay
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
 MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
 REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
@@ -299,7 +298,7 @@ class Pairing:
         if aids.noise == "identified":
             noise = noise.learn(now.square, count, now.frames, now.variance - now.frames * frame)
         counts = self._is_informative(h, lengths, noise)[..., None]
-        evidence = np.minimum(innovations.square / innovations.capped, NIS_CAP) + m * np.log(innovations.capped)
+        evidence = innovations.square / innovations.capped + m * np.log(innovations.capped)
         scores = aids.score_memory * state.scores + evidence * counts
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin

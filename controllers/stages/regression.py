@@ -25,7 +25,7 @@ a rotation, to large ones, for which the nominal model is hardly more than one r
 there is a second filter whose M walks seven times as fast: of a camera that turns while the arm moves, or of frames
 whose delay swings, which look alike. Evidence has to choose it, as the walk costs accuracy where the camera stands.
 
-    ℓ_b ← ℓ_b + min(‖ν‖²/s', cap) + m ln s',   μ_b ∝ exp(−ℓ_b/2),   W̄ = Σ μ_b W_b
+    ℓ_b ← ℓ_b + ‖ν‖²/s' + m ln s',   μ_b ∝ exp(−ℓ_b/2),   W̄ = Σ μ_b W_b
 
 Three successive frames that do not fit the estimate, but agree with each other, show a moved camera: P returns to the
 prior.
@@ -46,7 +46,6 @@ from servobench.plant.contract.signals import BoolArray
 
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
-NIS_CAP: Final = 30.0  # [1] of ‖ν‖²/s' of one motion in the score of a filter
 LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
@@ -231,7 +230,7 @@ class Regression:
         walk = (np.sqrt(square) * moved)[..., None, None] * self._walk
         model = REST_DRIFT**2 * duration[..., None] + MODEL_ERROR**2 * square[..., None]
         bank, found = learn(state.bank, h[..., None, :], feature_step, frame, model, walk, moved[..., None])
-        evidence = np.minimum(found.square / found.capped, NIS_CAP) + self._m * np.log(found.capped)
+        evidence = found.square / found.capped + self._m * np.log(found.capped)
         scores = state.scores + evidence * moved[..., None]
         scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
         best = scores.argmin(axis=-1)

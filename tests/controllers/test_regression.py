@@ -223,7 +223,7 @@ def regressors(middle, step, x):
 
 def test_the_weights_are_the_posterior_of_the_filters_given_all_motions(monkeypatch):
     """Each filter says that motions are jointly normal, with a covariance by prior, walk, model and frames."""
-    for name, value in {"MODEL_ERROR": 0.1, "GATE": 1e9, "NIS_CAP": 1e9, "LEAD_CAP": 1e9}.items():
+    for name, value in {"MODEL_ERROR": 0.1, "GATE": 1e9, "LEAD_CAP": 1e9}.items():
         monkeypatch.setattr(stage, name, value)
     run = Walking().follow(14, lambda q: 1.1 * NOMINAL @ q + [0.5 * q[0] * q[1], 0.0, 0.0], NOMINAL)
     H = np.array([regressors(*each[:3]) for each in run.seen])
