@@ -76,9 +76,10 @@ def draw(resolved: ResolvedRun) -> Drawn:
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
     true, sample, cameras = draw_robot(request)
-    if (made := true.feature(np.stack([robot.workspace.home] * 2)).shape) != (2, len(true.channel.names)):
-        wanted = f"(..., {len(true.channel.names)}) features of points (..., c, p, 3)"
-        raise ConfigurationError(f"sensing {request.sensing}: measure must return {wanted}, got {made} of (2, c, p, 3)")
+    m = len(true.channel.names)
+    if (made := true.feature(np.stack([robot.workspace.home] * 2)).shape) != (2, m):
+        wanted = f"measure must return {m} features along the last axis"
+        raise ConfigurationError(f"sensing {request.sensing}: {wanted}, got the shape {made} for two postures")
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
@@ -119,11 +120,11 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
 def _check_reference(scenario: object, m: int) -> None:
     """Refuse what a user's task returns in place of a scenario, or of `m` finite features at each instant."""
     if not isinstance(scenario, Scenario):
-        raise ValueError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")  # noqa: TRY004
+        raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
     points = np.asarray(scenario.reference.at(np.linspace(0.0, scenario.duration, POINTS)))
     if points.shape != (POINTS, m) or not np.isfinite(points).all():
-        first = f"{points[:1].tolist()} of shape {points.shape}"
-        raise ValueError(f"its reference must be {m} finite features at each of {POINTS} instants, got {first}")
+        came = f"shape {points.shape} and {points[:1].tolist()}"
+        raise ConfigurationError(f"its reference must be {m} finite features at each of {POINTS} instants, got {came}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,10 +129,8 @@ class RunRequest:
         for short in SHORT_NAMES.values():  # their columns hold numbers
             value = by_role.get(short.key)
             if isinstance(value, str) and (parts := split_quantity(value)):
-                try:
+                with configuration_errors(f"{short.key} = {value!r} must be "):
                     value = in_own_unit(*parts, "s" if short.unit else "1")
-                except ValueError as error:
-                    raise ConfigurationError(f"{short.key} must be {error}, got {value!r}") from error
             if isinstance(value, int | float):
                 by_role[short.key] = float(value)
         return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))

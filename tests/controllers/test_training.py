@@ -273,7 +273,7 @@ def test_an_empty_region_means_the_one_in_which_the_robot_works(networks):
     with pytest.raises(ValueError, match="training needs a region"):
         obtain_networks(empty, knowledge(region=None))
     with pytest.raises(ValueError, match="training needs a nominal model"):
-        obtain_networks(empty, knowledge(nominal_jacobian=None, region=None))
+        obtain_networks(CONFIG, knowledge(nominal_jacobian=None))
 
 
 def test_all_presets_take_their_networks_from_the_harness(networks):

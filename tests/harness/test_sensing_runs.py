@@ -298,7 +298,7 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     assert axis_first != OWN
     file.write_text(axis_first)
     with pytest.raises(
-        ConfigurationError, match=r"side.py: measure must return \(..., 3\) features .*, got \(3, 2\) of"
+        ConfigurationError, match=r"side.py: measure must return 3 features along .*, got the shape \(3, 2\)"
     ):
         run_experiment(request(str(file)), Settings({}))
     (tmp_path / "none.py").write_text("x = 1\n")
