@@ -102,7 +102,7 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
         (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at each .*, got .*nan"),
         (
             ("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
-            r"its .* 3 finite features .*of shape \(12, 2\)",
+            r"its .* 3 finite features .*got shape \(12, 2\)",
         ),
     ],
 )
