@@ -129,23 +129,14 @@ def _check_reference(scenario: object, m: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A run made ready, or runs that advance together: true robots drawn, plant and controller built.
+    """A run made ready, or runs that advance together: true robots drawn, plant and controller built."""
 
-    Attributes:
-        plant: of runs that advance together a bench with a lane for each.
-        controller: likewise.
-        runs: the true robot and the task of each run.
-        run: the settings that all of them share.
-        networks: that the controller started from, if any.
-        together: whether there are lanes, also for a single run.
-    """
-
-    plant: Plant
-    controller: Controller
-    runs: tuple[Drawn, ...]
-    run: RunSettings
-    networks: Sequence[TrainedNetworks] = ()
-    together: bool = False
+    plant: Plant  # of runs that advance together a bench with a lane for each
+    controller: Controller  # likewise
+    runs: tuple[Drawn, ...]  # the true robot and the task of each run
+    run: RunSettings  # the settings that all of them share
+    networks: Sequence[TrainedNetworks] = ()  # that the controller started from, if any
+    together: bool = False  # whether there are lanes, also for a single run
 
     @property
     def drawn(self) -> Drawn:
