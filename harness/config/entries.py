@@ -52,17 +52,11 @@ class BenchSettings:
 
 @dataclass(frozen=True, eq=False)
 class Guarded:
-    """A function of a user, whose errors are one line and whose result is of a known kind.
+    """A function of a user, whose errors are one line and whose result is of a known kind."""
 
-    Attributes:
-        make: called with the settings and a `RobotKnowledge` or `PlantSetup`.
-        kind: class of the result; None for any.
-        with_config: whether it takes the settings.
-    """
-
-    make: Callable[..., Any]
-    kind: type[Controller] | type[Plant] | None = None
-    with_config: bool = True
+    make: Callable[..., Any]  # called with the settings and a `RobotKnowledge` or `PlantSetup`
+    kind: type[Controller] | type[Plant] | None = None  # class of the result; None for any
+    with_config: bool = True  # whether it takes the settings
 
     def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - an object of `kind`
         """Return the result.
