@@ -114,7 +114,12 @@ def locked(folder: Path) -> Iterator[Lock]:
 
 
 def current_holder(folder: Path) -> Holder | None:
-    """Return the process that writes a folder, as far as it can be told; None if none does."""
+    """Return the process that writes a folder, as far as it can be told; None if none does.
+
+    Raises:
+        ConfigurationError: a link or pipe is in the folder.
+    """
+    refuse_links(folder)
     holder = Holder.read(folder / LOCK)
     return None if holder is None or holder.gone else holder
 

@@ -249,6 +249,7 @@ def table_beside(table: pa.Table) -> Callable[[Path], object]:
 
 
 runs, steps = partial(rewritten, results.RUNS), partial(rewritten, results.STEPS)
+LATEX = "statistics {} --latex"
 FIGURE = "figures {} --kind errors --format svg"
 EXPORT, MCAP = "export {} --out out", "export {} --out out --format mcap"
 ODD = {  # what a folder holds: the command, its exit code, and words of its one line
@@ -267,6 +268,11 @@ ODD = {  # what a folder holds: the command, its exit code, and words of its one
     "a camera that moves at a word": (manifest(configuration={"run": {"camera_moves_at": "noon"}}), FIGURE, 0, ""),
     "lists in lists": (lists_in_lists, "report {}", 2, "nested too deeply"),
     "code that is a list": (manifest(plugins=[1]), "statistics {}", 2, "plugins must be an object of an object"),
+    "changes that are none": (manifest(changed=1.5), LATEX, 2, "changed must be an object, got '1.5'"),
+    "a version that is a command": (
+        manifest(robots=[{}], packages={"servobench": r"\input{x}"}), LATEX, 0, r"\textbackslash{}input\{x\}~",
+    ),
+    "a pipe for a lock": (lambda folder: os.mkfifo(folder / ".lock"), "verify {}", 2, "a results folder holds files"),
     "words for pandas": (hostile_metadata, "verify {}", 1, "nothing vouches"),
     "a table beside that is a bomb": (table_beside(BOMB), "report {}", 2, "it unpacks to 3e+07 cells"),
     "a table beside with lists": (table_beside(pa.table({"a": [[1, 2], [3]]})), "report {}", 0, ""),
