@@ -103,8 +103,9 @@ def locked(folder: Path) -> Iterator[Lock]:
     lock = Lock(path, descriptor, stale)
     try:
         with contextlib.suppress(OSError):  # a full disk does not keep the lock from being held
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
+            if os.fstat(descriptor).st_nlink == 1:  # otherwise it is also a file elsewhere
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
         yield lock
     finally:
         with contextlib.suppress(OSError):  # the folder may be gone, or read-only by now

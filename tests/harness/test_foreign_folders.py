@@ -244,6 +244,13 @@ def differing_parts(folder: Path) -> None:
         (folder / name).unlink()
 
 
+def large_numbers(folder: Path) -> None:
+    """Put a whole number into one part that has no place among the floats of the other."""
+    differing_parts(folder)
+    name = results.part_name(1, results.STEPS)
+    write_vouched(folder, {name: pd.read_parquet(folder / name).assign(jacobian_error=2**63 - 1).to_parquet})
+
+
 def table_beside(table: pa.Table) -> Callable[[Path], object]:
     return lambda folder: pa.parquet.write_table(table, folder / "more.parquet")
 
@@ -264,6 +271,7 @@ ODD = {  # what a folder holds: the command, its exit code, and words of its one
     "steps at no time": (steps(lambda old: old.assign(time_s=np.nan)), MCAP, 2, "steps at no time"),
     "steps without a number": (steps(lambda old: old.assign(jacobian_error=None)), MCAP, 0, ""),
     "columns of several types": (differing_parts, "collect {}", 2, "Unable to merge"),
+    "numbers that are no floats": (large_numbers, "collect {}", 2, "not in range"),
     "a part behind the last run": (part_behind_the_last_run, "verify {}", 1, "holds more runs than the batch has"),
     "a camera that moves at a word": (manifest(configuration={"run": {"camera_moves_at": "noon"}}), FIGURE, 0, ""),
     "lists in lists": (lists_in_lists, "report {}", 2, "nested too deeply"),
