@@ -153,29 +153,22 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
+    from servobench.harness.studies import reproduction
     from servobench.harness.studies.claims import DIVISIONS
-    from servobench.harness.studies.reproduction import (
-        ANSWERS,
-        FIGURES,
-        differences,
-        elsewhere,
-        read_answers,
-        reproduce,
-    )
 
     names = selection.split("plants", plants)
     divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
-    wanted = None if check is None else read_answers(check)
+    wanted = None if check is None else reproduction.read_answers(check)
     with watching(console, out, running.execution()) as how:
-        answers = reproduce(out, names, seeds, how, divisions)
+        answers = reproduction.reproduce(out, names, seeds, how, divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
-        verdict = answer.verdict + elsewhere(answer, answers)
+        verdict = answer.verdict + reproduction.elsewhere(answer, answers)
         console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
-    say(f"answers in {out / ANSWERS}, figures in {out / FIGURES}")
+    say(f"answers in {out / reproduction.ANSWERS}, figures in {out / reproduction.FIGURES}")
     if wanted is not None:
-        lines = differences(answers, wanted)
+        lines = reproduction.differences(answers, wanted)
         say("\n".join(lines) or f"the same answers as in {check}")
         if lines:
             sys.exit(FAILED)
