@@ -42,17 +42,11 @@ class UkfConfig(kalman.RandomWalk):
 
 @dataclass(frozen=True, eq=False)
 class SigmaWeights:
-    """Weights of the scaled sigma points.
+    """Weights of the scaled sigma points."""
 
-    Attributes:
-        reach: √(s + Λ), how many deviations the points stand off.
-        mean: wᵐ, (2s+1,).
-        covariance: wᶜ, (2s+1,).
-    """
-
-    reach: float
-    mean: FloatArray
-    covariance: FloatArray
+    reach: float  # √(s + Λ), how many deviations the points stand off
+    mean: FloatArray  # wᵐ, (2s+1,)
+    covariance: FloatArray  # wᶜ, (2s+1,)
 
 
 @cache

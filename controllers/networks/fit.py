@@ -182,7 +182,10 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
     """
     if not config.lower:
         if knowledge.region is None:
-            raise ValueError("training needs a region: give lower and upper, one number a joint, rad")
+            needed = (
+                "lower and upper, one number a joint, rad, and a nominal model, such as nominal in an FMU's mapping"
+            )
+            raise ValueError(f"training needs a region and a model of the robot: give {needed}")
         lower, upper = knowledge.region
         config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
     spec = knowledge.spec
@@ -191,7 +194,9 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
     elif knowledge.nominal_jacobian is not None:
         networks = train(config, knowledge.nominal_jacobian, spec)
     else:
-        raise ValueError("training needs a nominal model, and this plant has none")
+        raise ValueError(
+            "training needs a nominal model, and this plant has none; an FMU gets one by nominal in its mapping"
+        )
     if (networks.jacobian.n, networks.jacobian.m) != (spec.n, spec.m):
         raise ValueError(
             f"network must be of {spec.n} joints and {spec.m} features, "

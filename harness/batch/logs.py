@@ -13,7 +13,7 @@ from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
@@ -74,10 +74,8 @@ def logged_in_folder(
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
         del asked["robot"]
-    try:
+    with configuration_errors(f"{folder} has a varied setting that is no value: "):
         varied = varied_in_row(row)
-    except ValueError as error:
-        raise ConfigurationError(f"{folder} has a varied setting that is no value: {error}") from error
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
     request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)

@@ -30,7 +30,7 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
-    name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
+    name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")] = "",
     folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
     aids: Annotated[bool, named_option("--aids", "", "A controller with the aids of the bench's methods.")] = False,
 ) -> None:

@@ -76,6 +76,10 @@ def draw(resolved: ResolvedRun) -> Drawn:
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
     true, sample, cameras = draw_robot(request)
+    m = len(true.channel.names)
+    if (made := true.feature(np.stack([robot.workspace.home] * 2)).shape) != (2, m):
+        wanted = f"measure must return {m} features along the last axis"
+        raise ConfigurationError(f"sensing {request.sensing}: {wanted}, got the shape {made} for two postures")
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
@@ -107,30 +111,32 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         raise ConfigurationError(f"task {name}: {why}")
     with configuration_errors(f"task {name}: "):
         scenario = task.scenario(setting)
+        _check_reference(scenario, len(setting.feature.names))
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
 
 
+def _check_reference(scenario: object, m: int) -> None:
+    """Refuse what a user's task returns in place of a scenario, or of `m` finite features at each instant."""
+    if not isinstance(scenario, Scenario):
+        raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
+    points = np.asarray(scenario.reference.at(np.linspace(0.0, scenario.duration, POINTS)))
+    if points.shape != (POINTS, m) or not np.isfinite(points).all():
+        came = f"shape {points.shape} and {points[:1].tolist()}"
+        raise ConfigurationError(f"its reference must be {m} finite features at each of {POINTS} instants, got {came}")
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A run made ready, or runs that advance together: true robots drawn, plant and controller built.
+    """A run made ready, or runs that advance together: true robots drawn, plant and controller built."""
 
-    Attributes:
-        plant: of runs that advance together a bench with a lane for each.
-        controller: likewise.
-        runs: the true robot and the task of each run.
-        run: the settings that all of them share.
-        networks: that the controller started from, if any.
-        together: whether there are lanes, also for a single run.
-    """
-
-    plant: Plant
-    controller: Controller
-    runs: tuple[Drawn, ...]
-    run: RunSettings
-    networks: Sequence[TrainedNetworks] = ()
-    together: bool = False
+    plant: Plant  # of runs that advance together a bench with a lane for each
+    controller: Controller  # likewise
+    runs: tuple[Drawn, ...]  # the true robot and the task of each run
+    run: RunSettings  # the settings that all of them share
+    networks: Sequence[TrainedNetworks] = ()  # that the controller started from, if any
+    together: bool = False  # whether there are lanes, also for a single run
 
     @property
     def drawn(self) -> Drawn:

@@ -34,6 +34,7 @@ from servobench.harness.run.experiment import Experiment, build, draw, draw_robo
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
+from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
@@ -80,7 +81,8 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     try:
         recorded = record(controller.servo, _start, _step, shapes)
     except NotTraceable as error:
-        raise ConfigurationError(f"controller {entry.name!r} has no exported form: {error}") from error
+        where = f" with --sensing {resolved.request.sensing}" * (resolved.request.sensing != DEFAULT_SENSING)
+        raise ConfigurationError(f"controller {entry.name!r} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)
     if not difference <= TOLERANCE:

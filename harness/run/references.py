@@ -22,6 +22,7 @@ import numpy.typing as npt
 from servobench.harness.run.log import column_unit
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.camera import CAMERA
@@ -128,10 +129,8 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     """
     names = ["time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names)]
     values = numbers_of(f"waypoint file {path}", read_table("waypoint file", path), names)
-    try:
+    with configuration_errors(f"waypoint file {path}: "):
         return Waypoints(values[:, 0], values[:, 1:])
-    except ValueError as error:
-        raise ValueError(f"waypoint file {path}: {error}") from error
 
 
 class ImageReference(Reference):

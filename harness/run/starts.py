@@ -51,19 +51,12 @@ IN_VIEW: Final = 0.9  # of the image's half sides in which the target is at the 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Where to draw.
+    """Where to draw."""
 
-    Attributes:
-        lower: (n,) [rad].
-        upper: (n,) [rad].
-        shortest: motion from start to target that the ball of the planned fixed camera would need [m].
-        lowest: height of the ball, or of the camera on the hand, above the table [m].
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    shortest: float
-    lowest: float
+    lower: FloatArray  # (n,) [rad]
+    upper: FloatArray  # (n,) [rad]
+    shortest: float  # motion from start to target that the ball of the planned fixed camera would need [m]
+    lowest: float  # height of the ball, or of the camera on the hand, above the table [m]
 
 
 def draw_in_view(

@@ -30,19 +30,12 @@ SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element acces
 
 
 class ArmGeometry(NamedTuple):
-    """Everything that describes an arm without its ball, as CasADi symbols or constants.
+    """Everything that describes an arm without its ball, as CasADi symbols or constants."""
 
-    Attributes:
-        translation: (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`.
-        rpy: (n+1, 3), rad.
-        joint_offset: o, (n,), rad.
-        gear_ratio: g, (n,).
-    """
-
-    translation: SX
-    rpy: SX
-    joint_offset: SX
-    gear_ratio: SX
+    translation: SX  # (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`
+    rpy: SX  # (n+1, 3), rad
+    joint_offset: SX  # o, (n,), rad
+    gear_ratio: SX  # g, (n,)
 
     @classmethod
     def of(cls, arm: SerialArm) -> Self:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -62,10 +62,8 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
         ConfigurationError: it cannot be read, or is not valid TOML.
     """
     text = read_text(kind, path)
-    try:
+    with configuration_errors(f"{kind} {path} is not valid TOML: ", RecursionError):
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
-        raise ConfigurationError(f"{kind} {path} is not valid TOML: {error}") from error
 
 
 def read_text(kind: str, path: Path) -> str:
@@ -88,10 +86,8 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
         raise ConfigurationError(
             f"{kind} {path} has {marks[0]!r} between its columns; write commas, and numbers as 0.5"
         )
-    try:
+    with configuration_errors(f"{kind} {path} is no table: ", OSError):
         table = pd.read_parquet(path) if text is None else pd.read_csv(io.StringIO(text), skipinitialspace=True)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"{kind} {path} is no table: {error}") from error
     if text is not None and type(table.index) is not pd.RangeIndex:  # the first cells were taken for names of rows
         raise ConfigurationError(f"{kind} {path} has rows of more cells than its header; write numbers as 0.5")
     return table.rename(columns=str.strip)

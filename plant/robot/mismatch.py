@@ -163,7 +163,7 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         ValueError: an unknown axis, a malformed or an empty range, or a magnitude out of its bounds.
     """
     if axis not in AXES:
-        raise ValueError(f"unknown mismatch axis {axis!r}: {suggest(axis, AXES)}")
+        raise ValueError(f"unknown mismatch axis {axis!r} (a setting is as kinematic.lag): {suggest(axis, AXES)}")
     example = RANGES[re.sub("[0-9.]", "", AXES[axis][1])]
     number = r"[0-9]*\.?[0-9]+"
     match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())

@@ -92,7 +92,11 @@ def test_folders_that_are_no_parts_of_one_batch_are_not_merged(undisturbed, tmp_
     part, other = *parts(tmp_path, monkeypatch, 3, (1,)), str(tmp_path / "other")
     servobench(monkeypatch, *SWEEP, "--seeds", "5", "--part", "1/9", "--out", other)
     capsys.readouterr()
-    wrong = {part: "have the same runs: leave one away", str(undisturbed): "nothing to be merged", other: "seeds 0:5 there"}
+    wrong = {
+        part: "have the same runs: leave one away",
+        str(undisturbed): "nothing to be merged",
+        other: "seeds 0:5 there",
+    }
     for folder, words in wrong.items():
         assert servobench(monkeypatch, "merge", part, folder, "--out", str(tmp_path / "merged")) == 2
         assert words in capsys.readouterr().err

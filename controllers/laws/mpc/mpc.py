@@ -78,25 +78,15 @@ class Plan(NamedTuple):
 
 
 class MpcState(NamedTuple):
-    """The state of the predictive law.
+    """The state of the predictive law."""
 
-    Attributes:
-        sent: (..., D, n), rad, the steps sent in the last `delay` seconds, the newest one last.
-        last: (..., n), rad, the last step sent.
-        fallbacks: (...), commands without a solution so far.
-        J: (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two.
-        targets: (..., moves, m), of the last command.
-        final: (..., m), m, error at the end of the horizon if the arm stood still.
-        plan: of the last command.
-    """
-
-    sent: FloatArray
-    last: FloatArray
-    fallbacks: FloatArray
-    J: FloatArray
-    targets: FloatArray
-    final: FloatArray
-    plan: Plan
+    sent: FloatArray  # (..., D, n), rad, the steps sent in the last `delay` seconds, the newest one last
+    last: FloatArray  # (..., n), rad, the last step sent
+    fallbacks: FloatArray  # (...), commands without a solution so far
+    J: FloatArray  # (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two
+    targets: FloatArray  # (..., moves, m), of the last command
+    final: FloatArray  # (..., m), m, error at the end of the horizon if the arm stood still
+    plan: Plan  # of the last command
 
 
 @final

@@ -42,19 +42,12 @@ WHOLE = 1e-9  # [1] a share of a period below which a delay is a whole number of
 
 
 class StateSpace(NamedTuple):
-    """A discrete linear system.
+    """A discrete linear system."""
 
-    Attributes:
-        A: (s, s).
-        B: (s, inputs).
-        C: (outputs, s).
-        D: (outputs, inputs).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    A: FloatArray  # (s, s)
+    B: FloatArray  # (s, inputs)
+    C: FloatArray  # (outputs, s)
+    D: FloatArray  # (outputs, inputs)
 
     def response(self, z: ComplexArray) -> ComplexArray:
         """Return C (zI − A)⁻¹ B + D, (k, outputs, inputs), at the points z, (k,), of the complex plane."""
@@ -110,21 +103,13 @@ def is_stable(A: FloatArray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Arm and camera around a rest.
+    """Arm and camera around a rest."""
 
-    Attributes:
-        jacobian: J, (m, n), unit of the feature per rad.
-        period: dt [s].
-        lag: τ [s]; 0 for joints that have the commanded velocity at once.
-        command_delay: D [s].
-        latency: ℓ [s].
-    """
-
-    jacobian: FloatArray
-    period: float
-    lag: float
-    command_delay: float
-    latency: float
+    jacobian: FloatArray  # J, (m, n), unit of the feature per rad
+    period: float  # dt [s]
+    lag: float  # τ [s]; 0 for joints that have the commanded velocity at once
+    command_delay: float  # D [s]
+    latency: float  # ℓ [s]
 
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
@@ -221,17 +206,11 @@ def frequencies(period: float, points: int = POINTS) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LoopResponse:
-    """The frequency response of a controller on an arm, and of the loops that they make.
+    """The frequency response of a controller on an arm, and of the loops that they make."""
 
-    Attributes:
-        frequency: ω, (k,) [rad/s], ascending.
-        controller: from the measured feature and joint positions to the command, (k, n, m + n) [rad/s].
-        arm: linear model of arm and camera.
-    """
-
-    frequency: FloatArray
-    controller: ComplexArray
-    arm: ArmModel
+    frequency: FloatArray  # ω, (k,) [rad/s], ascending
+    controller: ComplexArray  # from the measured feature and joint positions to the command, (k, n, m + n) [rad/s]
+    arm: ArmModel  # linear model of arm and camera
 
     @property
     def z(self) -> ComplexArray:
