@@ -35,6 +35,7 @@ from servobench.harness.analysis.comparison import (
     shown_value,
     split_conditions,
     split_tasks,
+    texts_of,
     with_places,
 )
 from servobench.harness.analysis.statistics import (
@@ -281,7 +282,8 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     varied = {short.heading: (short.column, short.scale) for short in SHORT_NAMES.values()}
     varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
     texts = {
-        name: [shown_value(value, scale, MISSING) for value in runs[column]] for name, (column, scale) in varied.items()
+        name: [shown_value(value, scale, MISSING) for value in texts_of(runs, column)]
+        for name, (column, scale) in varied.items()
     }
     keys = ["plant", "task", "mismatch", *varied, "controller", "outcome"]
     named = with_places(runs).assign(outcome=outcomes(runs), **texts)

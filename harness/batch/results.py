@@ -256,6 +256,7 @@ def missing_line(count: int, wanted: int) -> str:
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
     """Yield the table of runs of a finished batch, some thousand rows at a time and those of `columns` it has."""
     _refuse_damaged(folder, [RUNS])
+    refuse_lacking(folder / RUNS, "runs", tables.common_schema(folder, [RUNS]))
     return tables.row_groups(folder, RUNS, columns)
 
 

@@ -33,7 +33,7 @@ from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
-from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest, write_atomically
 
@@ -281,6 +281,10 @@ def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, mon
     groups = list(results.iterate_runs(folder, ["seed", "no such column"]))
     assert [list(group.columns) for group in groups] == [["seed"]] * 3
     assert [group["seed"].tolist() for group in groups] == [[0, 1], [2, 3], [4]]
+    changed = results.load_runs(folder).drop(columns="controller")
+    write_vouched(folder, {results.RUNS: changed.to_parquet})
+    with pytest.raises(ConfigurationError, match="it lacks the column controller"):
+        results.iterate_runs(folder, ["seed"])
 
 
 def read_runs(folder):
