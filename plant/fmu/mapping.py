@@ -105,7 +105,7 @@ class FmuMapping:
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
     nominal: Mapping[str, Numbers] | None = None
     """Nominal values of parameters, for controllers; needs directional derivatives. None: there is no nominal model."""
-    period: Positive | None = None
+    period: Annotated[Positive, Usual(1.0)] | None = None
     """[s] the FMU's step; None for the control period."""
     tolerance: Positive | None = None
     """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for the solver's own."""
