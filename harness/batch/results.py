@@ -249,7 +249,9 @@ def describe_missing(folder: Path) -> str:
 
 
 def missing_line(count: int, wanted: int) -> str:
-    """Return a line for the user that only `count` of the `wanted` runs are finished; an empty text if all are."""
+    """Return a line for the user that other than the `wanted` runs are finished; an empty text if these are."""
+    if 0 < wanted < count:
+        return f"{count} runs are there, and the manifest is of {wanted}: a file of another folder is among them"
     return f"{count} of {wanted} runs are there: --resume carries out the others" if count < wanted else ""
 
 
@@ -303,7 +305,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def has_steps(folder: Path) -> bool:
     """Return whether a results folder has a table of steps."""
-    return (folder / STEPS).is_file() or bool(part_names(folder, STEPS))
+    return is_expected(folder, STEPS) or bool(part_names(folder, STEPS))
 
 
 def check_folder(folder: Path) -> None:
@@ -346,7 +348,8 @@ def file_fault(folder: Path, name: str) -> str | None:
 
 def _intact(folder: Path, kind: str) -> list[str]:
     """Return the names of the table of one kind, or of its parts, all of them undamaged."""
-    names = [kind] if (folder / kind).is_file() else part_names(folder, kind)
+    names = [] if (folder / kind).is_file() else part_names(folder, kind)
+    names = names or [kind] * is_expected(folder, kind)
     _refuse_damaged(folder, names)
     return names
 
