@@ -125,8 +125,11 @@ def figures(
             for path in save_figure(named.figure, target / named.stem, formats, exact_width=True)
         ]
     if not files:
-        kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
-        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+        results.check_steps(folder)
+        needed = (
+            "errors and paths are of moves, tracking is of curves, settling, effort and smoothness are of several runs"
+        )
+        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}: {needed}")
     results.vouch(folder, files)
     say("\n".join(map(str, files)))
 
