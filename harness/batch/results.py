@@ -137,6 +137,23 @@ def part_names(folder: Path, kind: str) -> list[str]:
     return [name for name in names if is_expected(folder, name)]
 
 
+def copy_part(folder: Path, other: Path, index: int) -> None:
+    """Copy the part that begins with the run `index`, and the pictures of its runs, into another folder.
+
+    Raises:
+        ConfigurationError: a file of it is damaged.
+        UnwritableFolder: the other folder takes no more files.
+    """
+    names = [name for name in (part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)) if is_expected(folder, name)]
+    _refuse_damaged(folder, names)
+    runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
+    pictures = [name for name in (f"{PICTURES}/{run}.png" for run in runs) if (folder / name).is_file()]
+    with writing(other):
+        if pictures:
+            (other / PICTURES).mkdir(exist_ok=True)
+        write_vouched(other, {name: partial(shutil.copyfile, folder / name) for name in [*pictures, *names]})
+
+
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
     return [range(own, own + tables.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]

@@ -209,6 +209,20 @@ class Combinations:
         ),
     ] = "position"
     seeds: SeedsOption = "1"
+    part: Annotated[
+        str, execution_option("K/N", "Carry out part K of N of the runs only; servobench merge puts parts together.")
+    ] = "1/1"
+
+    def chosen_part(self) -> tuple[int, int]:
+        """Return K and N of --part.
+
+        Raises:
+            ConfigurationError: it does not name one of N parts.
+        """
+        words = self.part.split("/")
+        if len(words) == 2 and all(word.isdecimal() for word in words) and 1 <= int(words[0]) <= int(words[1]):
+            return int(words[0]), int(words[1])
+        raise ConfigurationError(f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}")
 
     def batch(self) -> Batch:
         """Return them as the planner takes them, each name looked up.

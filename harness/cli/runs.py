@@ -1,7 +1,8 @@
-"""The commands that carry runs out, `servobench run | compare`, and `train`."""
+"""The commands that carry runs out, `servobench run | compare`, and `merge` and `train`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -110,7 +111,24 @@ def compare(
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
-    _carry_out(campaign, out, judging.execution(running), with_report=with_report, strict=judging.strict)
+    how = replace(judging.execution(running), part=combinations.chosen_part())
+    _carry_out(campaign, out, how, with_report=with_report, strict=judging.strict)
+
+
+def merge(
+    folders: Annotated[list[Path], typer.Argument(help="Results folders of the parts of a batch, of --part.")],
+    out: Annotated[Path, option("FOLDER", "New folder for all of their runs.")],
+) -> None:
+    """Put the parts of a batch into one folder.
+
+    The parts of compare or sweep with --part. Where runs are missing, the same call with --resume carries them out.
+    """
+    from servobench.harness.batch import campaign, results
+
+    count = campaign.merge(folders, out, say)
+    if missing := results.describe_missing(out):
+        say(missing)
+    say(f"{count} runs in {out / results.RUNS}")
 
 
 def train(

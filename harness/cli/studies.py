@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -52,7 +53,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    with watching(console, out, judging.execution(running)) as how:
+    how = replace(judging.execution(running), part=combinations.chosen_part())
+    with watching(console, out, how) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
