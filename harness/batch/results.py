@@ -266,7 +266,9 @@ def describe_missing(folder: Path) -> str:
 
 
 def missing_line(count: int, wanted: int) -> str:
-    """Return a line for the user that only `count` of the `wanted` runs are finished; an empty text if all are."""
+    """Return a line for the user that other than the `wanted` runs are finished; an empty text if these are."""
+    if 0 < wanted < count:
+        return f"{count} runs are there, and the manifest is of {wanted}: a file of another folder is among them"
     return f"{count} of {wanted} runs are there: --resume carries out the others" if count < wanted else ""
 
 

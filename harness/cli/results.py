@@ -13,6 +13,7 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
+MAX_SATURATED: Final = 0.8  # share of the periods
 MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
 
 
@@ -108,6 +110,8 @@ def figures(
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):
         raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
+    if len(set(own)) < len(own):
+        raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
     if "pgf" in formats:
         check_tex()
     if missing := results.describe_missing(folder):
@@ -208,9 +212,13 @@ def say_aids(folder: Path) -> None:
 
 
 def print_faults(runs: pd.DataFrame) -> None:
-    """Print why runs failed, a line each; of many the first ones."""
+    """Print which controllers command too much, and why runs failed, a line each; of many the first ones."""
     from servobench.harness.run.result import COMPLETED
 
+    saturation = runs.reindex(columns=["controller", "saturation_fraction"])
+    for name, share in saturation.groupby("controller").median().itertuples():
+        if share > MAX_SATURATED:
+            remark(f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s")
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 

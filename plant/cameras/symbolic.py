@@ -18,6 +18,7 @@ from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics, project
 from servobench.plant.cameras.setups import POSITION, SensingSetup
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
@@ -123,10 +124,8 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     Raises:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
-    try:
+    with configuration_errors(f"sensing {setup.name} has no symbolic twin: ", TypeError, AttributeError, RuntimeError):
         made: Any = setup.measure(points, optics)
-    except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"sensing {setup.name} has no symbolic twin: {error}") from error
     return casadi.vertcat(*made[0].tolist())
 
 
