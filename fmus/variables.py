@@ -223,25 +223,15 @@ class ArmLayout(Layout):
 
 @dataclass(frozen=True)
 class Actuation:
-    """Parameters of the model other than its geometry.
+    """Parameters of the model other than its geometry."""
 
-    Attributes:
-        lag: time constant of the velocity loops [s], one for all joints or (n,).
-        max_speed: limit of the joint speeds [rad/s].
-        joint_range: distance of the stops from zero [rad].
-        home: (..., n) reported joint positions at the start [rad].
-        encoder_resolution: step of the encoders [rad], one for all joints or (n,); 0 for exact ones.
-        limits: of the arm's maker, which hold as well; None for none.
-        mechanics: gears and tool.
-    """
-
-    lag: float | FloatArray
-    max_speed: float
-    joint_range: float
-    home: FloatArray
-    encoder_resolution: float | FloatArray = 0.0
-    limits: JointLimits | None = None
-    mechanics: MechanicsConfig = RIGID
+    lag: float | FloatArray  # time constant of the velocity loops [s], one for all joints or (n,)
+    max_speed: float  # limit of the joint speeds [rad/s]
+    joint_range: float  # distance of the stops from zero [rad]
+    home: FloatArray  # (..., n) reported joint positions at the start [rad]
+    encoder_resolution: float | FloatArray = 0.0  # step of the encoders [rad], one for all or (n,); 0 for exact ones
+    limits: JointLimits | None = None  # of the arm's maker, which hold as well; None for none
+    mechanics: MechanicsConfig = RIGID  # gears and tool
 
     def stops(self, n: int) -> JointLimits:
         """Return speeds and stops of `n` joints."""

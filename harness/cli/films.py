@@ -96,9 +96,7 @@ def record(
         raise ConfigurationError(f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}")
     if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
         raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
-    wanted = selection.split_names(
-        "kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS, selection.among("kinds", KINDS)
-    )
+    wanted = selection.split_among("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:

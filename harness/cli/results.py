@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import JsonOption, named_option, option
+from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
@@ -34,9 +34,9 @@ def statistics(
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
-    markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
+    markdown: Annotated[bool, switch("--markdown", "Print the tables as Markdown.")] = False,
     latex: Annotated[
-        bool, named_option("--latex", "", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
+        bool, switch("--latex", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -89,7 +89,7 @@ def figures(
     controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
     names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
     width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 3.5in, 89mm or 252pt.")] = "7.2in",
-    title: Annotated[bool, named_option("--title/--no-title", "", "Write a title above each figure.")] = True,
+    title: Annotated[bool, switch("--title/--no-title", "Write a title above each figure.")] = True,
     format_: Annotated[
         str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")
     ] = "pdf",
@@ -103,10 +103,10 @@ def figures(
     from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
     from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
 
-    formats = selection.split_names("format", format_, ALL_FORMATS, selection.among("format", ALL_FORMATS))
-    kinds = selection.split_names("kind", kind, tuple(KINDS), selection.among("kind", tuple(KINDS)))
+    formats = selection.split_among("format", format_, ALL_FORMATS)
+    kinds = selection.split_among("kind", kind, tuple(KINDS))
     known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
-    shown = selection.split_names("controllers", controllers, known, selection.among("controllers", known))
+    shown = selection.split_among("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):
         raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")

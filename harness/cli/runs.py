@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option, switch
 from servobench.harness.cli.results import judge, make_report, print_faults, say_aids
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
@@ -26,7 +26,7 @@ DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 OutOption = Annotated[
     Path | None, named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
 ]
-ReportOption = Annotated[bool, named_option("--report/--no-report", "", "Also make the page report.html.")]
+ReportOption = Annotated[bool, switch("--report/--no-report", "Also make the page report.html.")]
 
 
 def run(
@@ -56,7 +56,7 @@ def run(
     sensing: options.SensingOption = "position",
     seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,
     overrides: options.Overrides,
-    view: Annotated[bool, named_option("--view", "", "Watch the bullet plant in a window.")] = False,
+    view: Annotated[bool, switch("--view", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
     limited: options.Limited,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
+from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge, say_aids
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import configuration_errors
@@ -197,10 +197,7 @@ def tune(
     ] = 0,
     study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
-        bool,
-        named_option(
-            "--check", "", "Change each tuned value in use one by one instead, and name changes that are better."
-        ),
+        bool, switch("--check", "Change each tuned value in use one by one instead, and name changes that are better.")
     ] = False,
     out: Annotated[Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"

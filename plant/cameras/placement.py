@@ -46,21 +46,13 @@ ON_HAND = "mount"  # the axis that a camera on the hand has
 
 @dataclass(frozen=True, eq=False)
 class CameraDraws:
-    """The values drawn for c cameras.
+    """The values drawn for c cameras."""
 
-    Attributes:
-        focal: (c,), factors on the focal lengths.
-        centre: (c, 2), shifts of the principal points [px].
-        distortion: (c,), k of the radial distortion [1].
-        turn: (c, 3), rotation vectors [rad] of the cameras after the first one, whose turn is that of the robot.
-        mount: (c, 3), rotation vectors [rad] about the cameras' own centres.
-    """
-
-    focal: FloatArray
-    centre: FloatArray
-    distortion: FloatArray
-    turn: FloatArray
-    mount: FloatArray
+    focal: FloatArray  # (c,), factors on the focal lengths
+    centre: FloatArray  # (c, 2), shifts of the principal points [px]
+    distortion: FloatArray  # (c,), k of the radial distortion [1]
+    turn: FloatArray  # (c, 3), rotation vectors [rad] of the cameras after the first, whose own is the robot's
+    mount: FloatArray  # (c, 3), rotation vectors [rad] about the cameras' own centres
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists, for JSON."""

@@ -65,19 +65,12 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
 
 @dataclass(frozen=True, eq=False)
 class SetupGeometry:
-    """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants.
+    """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants."""
 
-    Attributes:
-        arm: the arm.
-        target: p points, each (3,) [m].
-        cameras: of c cameras rotation (3, 3) and position (3,) [m] in the frame that they are mounted on.
-        optics: their intrinsics.
-    """
-
-    arm: ArmGeometry
-    target: list[SX]
-    cameras: list[tuple[SX, SX]]
-    optics: Optics
+    arm: ArmGeometry  # the arm
+    target: list[SX]  # p points, each (3,) [m]
+    cameras: list[tuple[SX, SX]]  # of c cameras rotation (3, 3) and position (3,) [m] in the frame of their mount
+    optics: Optics  # their intrinsics
 
     @classmethod
     def of(cls, arm: SerialArm, target: FloatArray, cameras: FloatArray, optics: Optics) -> Self:
