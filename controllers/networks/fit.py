@@ -83,21 +83,13 @@ def joint_samples(unit: FloatArray, lower: FloatArray, upper: FloatArray) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class ControllerSamples:
-    """Samples to which the controller network is fitted.
+    """Samples to which the controller network is fitted."""
 
-    Attributes:
-        xi: ξ, (S, p), m and rad.
-        error: e(k), (S, m), m.
-        position: q(k−1), (S, n), rad.
-        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m; with little in directions in which joints hardly move the feature.
-        posture_step: K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
-    """
-
-    xi: FloatArray
-    error: FloatArray
-    position: FloatArray
-    gain: FloatArray
-    posture_step: FloatArray
+    xi: FloatArray  # ξ, (S, p), m and rad
+    error: FloatArray  # e(k), (S, m), m
+    position: FloatArray  # q(k−1), (S, n), rad
+    gain: FloatArray  # K_p s J⁺ at q(k−1), (S, n, m), rad/m; little where joints hardly move the feature
+    posture_step: FloatArray  # K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y
 
     @property
     def command(self) -> FloatArray:

@@ -164,8 +164,10 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
         return []
     if not pairs:
         raise ConfigurationError(f"--metric {metric} is that by which pairs of controllers are compared; there is one")
-    metric = judged_metric(runs) if metric is None else metric
-    numbers = [str(name) for name in runs.select_dtypes("number").columns]
+    judged = judged_metric(runs)
+    metric = judged if metric is None else metric
+    filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
+    numbers = {judged, *map(str, filled)} & set(runs) - {"seed"}
     if metric not in numbers:
         raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))

@@ -69,6 +69,8 @@ def examine(folder: Path) -> Examination:
     findings, manifest = [], dict[str, Any]()
     try:
         manifest = results.read_manifest(folder)
+    except results.OtherSchema:
+        raise
     except ConfigurationError as error:
         unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
         findings.append(Finding(MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"))
@@ -106,7 +108,7 @@ def check_resumable(folder: Path) -> None:
         ConfigurationError: names it.
     """
     if not any((folder / name).exists() for name in (MANIFEST, RUNS, SUMS, PARTS)):
-        raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read")
+        results.read_manifest(folder)  # says why it cannot
 
 
 def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:

@@ -30,9 +30,10 @@ def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
     """Return the row of a run of a results folder; without a name the only one.
 
     Raises:
-        ConfigurationError: not a results folder, no such run, or several without a name.
+        ConfigurationError: not a results folder with steps, no such run, or several without a name.
     """
     runs = results.load_runs(folder)
+    results.check_steps(folder)
     names = runs["run_id"].tolist()
     if run_id is None and len(names) > 1:
         raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")

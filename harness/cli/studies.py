@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
+from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge, say_aids
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import configuration_errors
@@ -52,7 +53,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    with watching(console, out, judging.execution(running)) as how:
+    how = replace(judging.execution(running), part=combinations.chosen_part())
+    with watching(console, out, how) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
@@ -195,10 +197,7 @@ def tune(
     ] = 0,
     study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
-        bool,
-        named_option(
-            "--check", "", "Change each tuned value in use one by one instead, and name changes that are better."
-        ),
+        bool, switch("--check", "Change each tuned value in use one by one instead, and name changes that are better.")
     ] = False,
     out: Annotated[Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"

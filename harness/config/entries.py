@@ -374,25 +374,15 @@ def _describe(given: object) -> str:
 
 @dataclass(frozen=True)
 class Own(Generic[Entry]):
-    """A controller or plant that is no part of servobench and no entry point.
+    """A controller or plant that is no part of servobench and no entry point."""
 
-    Attributes:
-        word: "controller" or "plant".
-        entry: which builds it.
-        place: where it stands, for messages.
-        source: its file; None where other processes import its module.
-        file: path of the code; empty for code that was typed into an interpreter.
-        digest: SHA-256 of the code; empty where it cannot be read.
-        given: whether it was given as an object in Python.
-    """
-
-    word: str
-    entry: Entry
-    place: str
-    source: SourceFile | None = None
-    file: str = ""
-    digest: str = ""
-    given: bool = False
+    word: str  # "controller" or "plant"
+    entry: Entry  # which builds it
+    place: str  # where it stands, for messages
+    source: SourceFile | None = None  # its file; None where other processes import its module
+    file: str = ""  # path of the code; empty for code that was typed into an interpreter
+    digest: str = ""  # SHA-256 of the code; empty where it cannot be read
+    given: bool = False  # whether it was given as an object in Python
 
     @property
     def name(self) -> str:

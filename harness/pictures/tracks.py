@@ -165,7 +165,9 @@ def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | Non
     """Return the steps of each of these runs that has some, by its identifier; all columns, or those named."""
     try:
         steps = results.load_steps(folder, run_ids, columns)
-    except ConfigurationError:  # none is kept, or each of these runs ended before its first period
+    except ConfigurationError as error:  # none is kept, or each of these runs ended before its first period
+        if type(error) is not ConfigurationError:  # a file is damaged
+            raise
         return {}
     return {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
 

@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing, sensing_file
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
@@ -44,6 +44,8 @@ from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mis
 from servobench.plant.robot.robot import Robot
 
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
+MAX_PLACE: Final = 20.0  # [m] of a usual target
+MIN_RATE: Final = 10.0  # [mm/rad] usual norm of a Jacobian
 POINTS: Final = 12  # of a curve that are checked
 
 
@@ -265,6 +267,7 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     try:
         experiment = build(run, progress=progress)
         experiment.plant.close()
+        _check_features(run, experiment)
     except ConfigurationError:
         raise
     except BaseException as error:
@@ -283,6 +286,25 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     if experiment.drawn.true is not None:
         _check_joints(run, experiment.scenario, experiment.plant.spec)
         _check_reach(run, experiment.scenario, experiment.plant.spec)
+
+
+def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
+    """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move."""
+    spec, true, start = experiment.plant.spec, experiment.drawn.true, experiment.scenario.start
+    desired, task, unit = experiment.desired(), f"the reference of the task {run.request.task}", spec.feature_unit
+    if true is None or start is None:
+        if unit == "m" and (size := np.abs(desired).max()) > MAX_PLACE:
+            remark(f"{task} reaches {size:g} m; if places are meant in mm, write the unit, too")
+        return
+    speed = np.linalg.norm(np.diff(desired, axis=0), axis=1).max(initial=0.0) / spec.period
+    J = true.jacobian(start)
+    if speed > (most := float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)):
+        remark(f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start")
+    own = sensing_file(run.request.sensing) is not None
+    if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
+        remark(f"--sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
+    if own and unit == "mm" and np.linalg.norm(J) < MIN_RATE:
+        remark(f"--sensing {run.request.sensing}: features move by {np.linalg.norm(J):.2g} mm/rad; are they in m?")
 
 
 def train_networks(
@@ -412,6 +434,9 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     distances = np.array(_distances(nominal, tuple(map(tuple, points)), *limits))
     beyond = distances - _room(resolved.request.mismatch, robot, nominal.to_base(points))
     worst = int(beyond.argmax())
+    centre = float(np.linalg.norm(nominal.to_base(points) - robot.workspace.shoulder, axis=-1).min())
+    if centre < 0.5 * robot.workspace.reach[0]:
+        remark(f"task {task}: a target {1e3 * centre:.0f} mm from the arm's shoulder is within the arm itself")
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]

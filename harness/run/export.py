@@ -170,9 +170,10 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
-    if mechanical := [key for key in request.mismatch.plant_settings if key.startswith("mechanics.")]:
-        name = mechanical[0].removeprefix("mechanics.")
-        raise ConfigurationError(f"an arm is exported without {name}: leave it out, and set the FMU's parameter {name}")
+    moves = ["camera_move"] * (request.mismatch.size("camera_move") > 0.0)
+    for part, _, name in (each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]):
+        remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
+        raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     robot, (true, *_) = find_robot(request.robot), draw_robot(request)
     actuation = default_actuation(robot) if home is None else replace(default_actuation(robot), home=home)
     return product(ExportOptions(fmi, true, actuation, mismatch=words, robot=robot))

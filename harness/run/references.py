@@ -76,8 +76,8 @@ class Waypoints(Reference):
             raise ValueError(
                 f"waypoints need times (p,) and points (p, m), got {self.times.shape}, {self.points.shape}"
             )
-        if not (np.diff(self.times) > 0.0).all():
-            raise ValueError("waypoint times must ascend")
+        if not (np.diff(self.times) > 0.0).all() or self.times[0] < 0.0:
+            raise ValueError("waypoint times must ascend, the first one from 0 s on")
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return the interpolated points."""

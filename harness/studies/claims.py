@@ -95,25 +95,15 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to one claim on one plant.
+    """The answer to one claim on one plant."""
 
-    Attributes:
-        claim: its number; readings of the paper have a name instead.
-        statement: the claim in a few words.
-        plant: on which the claim was tested.
-        verdict: reproduced, not reproduced, or the cases on which it depends.
-        evidence: one line.
-        measurements: the numbers, for the table and the figure.
-        division: how the methods were equipped.
-    """
-
-    claim: str
-    statement: str
-    plant: str
-    verdict: str
-    evidence: str
-    measurements: tuple[Measurement, ...]
-    division: str = "best equipped"
+    claim: str  # its number; readings of the paper have a name instead
+    statement: str  # the claim in a few words
+    plant: str  # on which the claim was tested
+    verdict: str  # reproduced, not reproduced, or the cases on which it depends
+    evidence: str  # one line
+    measurements: tuple[Measurement, ...]  # the numbers, for the table and the figure
+    division: str = "best equipped"  # how the methods were equipped
 
     @property
     def title(self) -> str:

@@ -31,17 +31,11 @@ from servobench.plant.robot.mechanics import RippledJacobian
 
 
 class Frame(NamedTuple):
-    """A frame on its way to the controller.
+    """A frame on its way to the controller."""
 
-    Attributes:
-        due: number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
-        feature: (..., m).
-        valid: (..., m), which features are measured and will arrive.
-    """
-
-    due: int | FloatArray
-    feature: FloatArray
-    valid: BoolArray
+    due: int | FloatArray  # number of the sub-step after which it is delivered; with jitter, (...) and no whole number
+    feature: FloatArray  # (..., m)
+    valid: BoolArray  # (..., m), which features are measured and will arrive
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.description import FmuDescription, total_size
 
 Roles = TypeVar("Roles")
@@ -171,6 +172,10 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     for variable in inputs:
         if variable.causality != "input":
             raise ValueError(f"inputs names {variable.name!r}, which is of causality {variable.causality}")
+    given = mapping.names.feature_unit
+    for variable in features:
+        if variable.unit != given and {variable.unit, given} <= UNITS["m"].keys():
+            raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {given}")
     n, m = total_size(inputs), total_size(features)
     truth = mapping.truth
     for name, names, size in (

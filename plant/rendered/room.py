@@ -70,21 +70,13 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """An arm and the bodies around it; the base frame is the world frame.
+    """An arm and the bodies around it; the base frame is the world frame."""
 
-    Attributes:
-        arm: the true kinematics.
-        scenery: whether the table and the floor are there.
-        robot: by its maker's description, for the visual shapes.
-        boxes: obstacles.
-        rig: target and cameras of a sensing set-up; None for the ball on the flange.
-    """
-
-    arm: SerialArm
-    scenery: bool
-    robot: Robot
-    boxes: tuple[urdf.Box, ...] = ()
-    rig: Rig | None = None
+    arm: SerialArm  # the true kinematics
+    scenery: bool  # whether the table and the floor are there
+    robot: Robot  # by its maker's description, for the visual shapes
+    boxes: tuple[urdf.Box, ...] = ()  # obstacles
+    rig: Rig | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
 
     def files(self) -> dict[str, str]:
         """Return the files, text by name: a URDF for each body, that of the arm first, and the meshes they name.
@@ -151,15 +143,10 @@ def _normal(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A camera with the whole arm in its image, for films and environments.
+    """A camera with the whole arm in its image, for films and environments."""
 
-    Attributes:
-        camera: its optics.
-        X_BC: (4, 4), its pose in the base frame.
-    """
-
-    camera: PinholeCamera
-    X_BC: FloatArray
+    camera: PinholeCamera  # its optics
+    X_BC: FloatArray  # (4, 4), its pose in the base frame
 
     @classmethod
     def of(cls, scale: float, fineness: float = 1.0) -> Self:

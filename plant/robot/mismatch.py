@@ -201,7 +201,12 @@ def _range(name: str, text: str, begin: float, end: float, step: float) -> list[
         raise ValueError(f"the range {text!r} of {name} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
     if steps < 0.0:  # it begins beyond its end
         raise ValueError(f"the range {text!r} of {name} is empty")
-    return [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
+    values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
+    if steps - math.floor(steps) > 1e-6:
+        raise ValueError(
+            f"the range {text!r} of {name} must be begin:end:step, but its last step ends at {values[-1]:g}"
+        )
+    return values
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.command import servobench
-from kit.folders import comparison, made_up_row, made_up_steps, write_folder
+from kit.folders import comparison, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import (
     cost_table,
@@ -153,6 +155,45 @@ def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
         results.load_steps(tmp_path)
     with pytest.raises(ConfigurationError, match="is not a results folder"):
         results.collect(tmp_path)
+
+
+def without_steps(folder: Path) -> None:
+    sweep(folder)
+
+
+def without_file(name: str) -> Callable[[Path], None]:
+    return lambda folder: (comparison(folder, controllers=("constant",), tasks=("exp1",)) / name).unlink()
+
+
+def of_schema_3(folder: Path) -> None:
+    manifest = comparison(folder, controllers=("constant",), tasks=("exp1",)) / results.MANIFEST
+    manifest.write_text(manifest.read_text().replace('"schema_version": "4"', '"schema_version": "3"'))
+    (folder / SUMS).unlink()
+
+
+@pytest.mark.parametrize(
+    ("make", "command", "words"),
+    [
+        (without_steps, "shadow DIR --controller constant", "DIR holds no steps: a sweep keeps none; use run or c"),
+        (without_steps, "record DIR", "DIR holds no steps: a sweep keeps none"),
+        (without_steps, "export DIR --out new", "DIR holds no steps: a sweep keeps none"),
+        (without_steps, "figures DIR --kind errors", "DIR holds no steps: a sweep keeps none"),
+        (without_file(results.STEPS), "export DIR --out new", "DIR/steps.parquet is missing; repeat the command"),
+        (without_file(results.STEPS), "figures DIR", "DIR/steps.parquet is missing; repeat the command"),
+        (without_file(results.RUNS), "statistics DIR", "DIR/runs.parquet is missing; repeat the command"),
+        (of_schema_3, "verify DIR", "DIR has results of schema '3'; this servobench reads '4'; the column"),
+        (lambda folder: None, "statistics DIR", "DIR is not a results folder: it does not exist"),
+        (lambda folder: None, "verify DIR", "DIR is not a results folder: it does not exist"),
+    ],
+)  # fmt: skip
+def test_what_a_folder_lacks_is_named(monkeypatch, capsys, tmp_path, make, command, words):
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path / "DIR")
+    assert servobench(monkeypatch, *command.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"servobench: {words}")
+    assert said.count("\n") == 1
+    assert not (tmp_path / "new").exists()
 
 
 def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):

@@ -62,19 +62,12 @@ class MpcConfig:
 
 
 class Plan(NamedTuple):
-    """The moves of the last command and the result of the solver.
+    """The moves of the last command and the result of the solver."""
 
-    Attributes:
-        moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
-        success: (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before the first command.
-        iterations: (...), of the solver; 0 without an active limit.
-        active_limits: (...), NaN without a solution.
-    """
-
-    moves: FloatArray
-    success: FloatArray
-    iterations: FloatArray
-    active_limits: FloatArray
+    moves: FloatArray  # dq_1 … dq_H, or the one constant step, (..., moves, n), rad
+    success: FloatArray  # (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before a command
+    iterations: FloatArray  # (...), of the solver; 0 without an active limit
+    active_limits: FloatArray  # (...), NaN without a solution
 
 
 class MpcState(NamedTuple):

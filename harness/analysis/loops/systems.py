@@ -175,27 +175,16 @@ def split(delay: float, period: float) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class Margins:
-    """The margins of a loop.
+    """The margins of a loop."""
 
-    Attributes:
-        gain: the factor on the command above 1 at which the loop becomes unstable; inf if there is none.
-        gain_reduction: the factor below 1 at which it becomes unstable; 0 if there is none.
-        phase: [rad], of all features together; inf where no locus crosses the unit circle.
-        delay: additional latency of the camera at which the loop becomes unstable [s]; inf if there is none.
-        crossover: largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none does.
-        sensitivity_peak: M_s, at the feature [1].
-        complementary_peak: max σ̄(T), at the feature [1].
-        disk: α, at the feature [1].
-    """
-
-    gain: float
-    gain_reduction: float
-    phase: float
-    delay: float
-    crossover: float
-    sensitivity_peak: float
-    complementary_peak: float
-    disk: float
+    gain: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
+    gain_reduction: float  # the factor below 1 at which it becomes unstable; 0 if there is none
+    phase: float  # [rad], of all features together; inf where no locus crosses the unit circle
+    delay: float  # additional latency of the camera at which the loop becomes unstable [s]; inf if there is none
+    crossover: float  # largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none
+    sensitivity_peak: float  # M_s, at the feature [1]
+    complementary_peak: float  # max σ̄(T), at the feature [1]
+    disk: float  # α, at the feature [1]
 
 
 def frequencies(period: float, points: int = POINTS) -> FloatArray:
