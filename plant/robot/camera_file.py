@@ -303,7 +303,7 @@ def _check(camera: OwnCamera) -> None:
     if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
         image = f"an image of {keys.width} × {keys.height} px before its corners"
         raise ValueError(
-            f"distortion {list(camera.distortion)} folds {image}; take size, matrix and it of one calibration"
+            f"distortion {list(camera.distortion)} folds {image}, with this matrix; take them from one calibration"
         )
     squares = np.linspace(0.0, math.hypot(*far) ** 2)
     if (moved := np.abs(squares * (k1 + squares * (k2 + squares * k3))).max()) > MAX_MOVED:

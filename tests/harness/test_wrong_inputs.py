@@ -211,7 +211,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("shadow", "columns.csv", "--controller", "constant"), "log columns.csv has no column time_s; it needs time_s"),
     (("shadow", "text.csv", "--controller", "constant", "--sensing", "pixl"), "did you mean 'pixel'?"),
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "it holds something that is no formula"),
-    (("fmu", "export", "--controller", "mfac+rls", "--sensing", "plate", "-o", "new.fmu"), "with --sensing plate:"),
+    (("fmu", "export", "--controller", "mfac+rls", "--sensing", "plate", "-o", "new.fmu"), "plate, but perhaps with"),
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
     (("fmu", "export", "-o", "none/new.fmu"), "the folder none for the FMU does not exist"),

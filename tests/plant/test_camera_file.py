@@ -162,7 +162,11 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
         ("615.0", "3.6", "a focal length of 3.6 px does not fit"),
         ("322.5", "1200.0", r"the principal point \[1200.0, 238.0\] px must be in the image"),
         ("matrix = ", "matrices = ", "has no setting 'matrices': did you mean 'matrix'"),
-        ("0.12", "-3.0", "folds an image of 640 × 480 px before its corners; take size, matrix and it of one"),
+        (
+            "0.12",
+            "-3.0",
+            "folds an image of 640 × 480 px before its corners, with this matrix; take them from one calibration",
+        ),
         ("k3", "k4", "distortion has no coefficient 'k4'; wanted plumb_bob with k1, k2, p1, p2, k3"),
         ("height", 'distortion_model = "fisheye"\nheight', "distortion_model 'fisheye' is not known; wanted plumb_bob"),
         ("[pose]", "vertical_fov = 60.0\n[pose]", "either matrix .px. or vertical_fov .deg. must be given, got both"),
