@@ -43,10 +43,17 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
+NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> another, and its values that leave it idle
+    "aids.latency": ("aids.delay", ("ignored", "identified")),
+    "initial.given": ("initial.source", ("nominal", "probe")),
+    "sensing.noise_offset": ("sensing.noise", ("white", "stable", "uniform")),
+    "sensing.outlier_size": ("sensing.outliers", (0.0,)),
+}
 REST: Final = "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
@@ -185,6 +192,7 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     check_settings(campaign.settings, runs.sections)
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
+    _remark_on_idle(campaign.settings, [select(request, sections) for request in runs.examples])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
@@ -334,6 +342,18 @@ def _without_effect(assignment: Assignment, examples: Iterable[RunRequest], step
     if key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
         return "no mismatch moves the camera, as camera_move=90deg does"
     return ""
+
+
+def _remark_on_idle(settings: Settings, runs: Iterable[ResolvedRun]) -> None:
+    """Remark on assignments to settings that count only together with another one."""
+    parts = [(run.request.plant, run.plant) for run in runs] + [
+        (run.request.controller, run.controller) for run in runs
+    ]
+    for section, key, text in settings.assigned:
+        name, idle = NEEDED.get(key, ("", ()))
+        values = [flatten(config).get(name) for part, config in parts if part == section]
+        if values and all(value in idle for value in values):
+            remark(f"--set {text} has no effect while {section}.{name} is {values[0]}")
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

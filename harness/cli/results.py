@@ -13,7 +13,6 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import remark
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -214,6 +213,7 @@ def say_aids(folder: Path) -> None:
 def print_faults(runs: pd.DataFrame) -> None:
     """Print which controllers command too much, and why runs failed, a line each; of many the first ones."""
     from servobench.harness.run.result import COMPLETED
+    from servobench.plant.contract.settings import remark
 
     saturation = runs.reindex(columns=["controller", "saturation_fraction"])
     for name, share in saturation.groupby("controller").median().itertuples():

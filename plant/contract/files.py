@@ -1,5 +1,7 @@
 """Atomic writing of files, and reading of a user's TOML and CSV with errors of one line."""
 
+from __future__ import annotations
+
 import io
 import os
 import re
@@ -7,12 +9,12 @@ import threading
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+
+if TYPE_CHECKING:
+    from servobench.plant.contract.checks import FloatArray
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -99,6 +101,7 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     Raises:
         ConfigurationError: one of them is missing or has something else than finite numbers, or there are no rows.
     """
+    import numpy as np  # noqa: PLC0415 - as above
     import pandas as pd  # noqa: PLC0415 - as above
 
     lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty

@@ -15,7 +15,6 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
@@ -81,6 +80,8 @@ class Pose(Place):
     @cached_property
     def matrix(self) -> FloatArray:
         """The pose in its frame, (4, 4)."""
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
+
         given = np.array(self.rotation) if len({np.size(row) for row in self.rotation}) == 1 else np.zeros(0)
         pose = np.eye(4)
         if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:

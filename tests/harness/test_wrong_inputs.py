@@ -339,6 +339,30 @@ def test_a_task_as_it_comes_is_not_remarked_on(caplog, task, sensing):
     assert not caplog.text
 
 
+@pytest.mark.parametrize(
+    ("assignment", "extra", "words"),
+    [
+        (
+            "kinematic.sensing.noise_offset=0.05",
+            (),
+            "noise_offset=0.05 has no effect while kinematic.sensing.noise is white",
+        ),
+        ("kinematic.sensing.outlier_size=0.1", (), "has no effect while kinematic.sensing.outliers is 0.0"),
+        ("kinematic.sensing.outlier_size=0.1", ("--mismatch", "outliers=20%"), ""),
+        ("constant.initial.given=[[1.0]]", (), "has no effect while constant.initial.source is nominal"),
+    ],
+)
+def test_a_setting_that_waits_for_another_is_remarked_on(
+    place, monkeypatch, caplog, tmp_path, assignment, extra, words
+):
+    monkeypatch.chdir(place)
+    remark.cache_clear()
+    short = "--set", "exp2.duration=0.1", "--out", str(tmp_path / "out")
+    assert servobench(monkeypatch, "sweep", "--plants", "kinematic", "--controllers", "constant", "--tasks", "exp2",
+                      "--seeds", "1", "--workers", "1", "--set", assignment, *extra, *short) == 0  # fmt: skip
+    assert words in caplog.text if words else not caplog.text
+
+
 def test_a_set_up_whose_features_share_a_name_is_refused_with_its_line(place, monkeypatch, capsys):
     monkeypatch.chdir(place)
     assert servobench(monkeypatch, *RUN, "--sensing", "./named_twice.py") == 2
