@@ -81,7 +81,9 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     try:
         recorded = record(controller.servo, _start, _step, shapes)
     except NotTraceable as error:
-        where = f" with --sensing {resolved.request.sensing}" * (resolved.request.sensing != DEFAULT_SENSING)
+        where = f" with --sensing {resolved.request.sensing}, but perhaps with another" * (
+            resolved.request.sensing != DEFAULT_SENSING
+        )
         raise ConfigurationError(f"controller {entry.name!r} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)

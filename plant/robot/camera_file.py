@@ -192,6 +192,7 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
     """
     toml = path.suffix.lower() == ".toml"
     values = read_toml("camera file", path) if toml else {"intrinsics": path.name}
+    values |= {key: in_rows(value) for key, value in values.items() if key == "matrix"}
     keys = override(f"camera file {path}", CameraFile(), values)
     if second and keys.second:
         raise ValueError(f"camera file {path} is the second of a pair and must name no other, got {keys.second}")
@@ -237,8 +238,13 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path.name} is of a larger image, of which binning or a region (roi) leaves a part; {remedy}"
         )
-    numbers = keys["matrix"] if isinstance(keys["matrix"], list) else []
-    return keys | {"matrix": [numbers[row : row + 3] for row in range(0, len(numbers), 3)]}
+    return keys | {"matrix": in_rows(keys["matrix"])}
+
+
+def in_rows(value: Any) -> Any:  # noqa: ANN401 - a value of a file
+    """Return a list of nine numbers as three rows, and anything else as it is."""
+    flat = isinstance(value, list) and len(value) == 9
+    return [value[row : row + 3] for row in (0, 3, 6)] if flat else value
 
 
 def _matrix(keys: CameraFile) -> FloatArray:
@@ -250,7 +256,8 @@ def _matrix(keys: CameraFile) -> FloatArray:
             raise ValueError(f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}")
     size = keys.width, keys.height
     if bool(keys.matrix) == (keys.vertical_fov is not None):
-        raise ValueError("one of matrix [px] and vertical_fov [deg] must be given")
+        came = "both" if keys.matrix else "neither"
+        raise ValueError(f"either matrix [px] or vertical_fov [deg] must be given, got {came}")
     f = 0.5 * size[1] / math.tan(math.radians(keys.vertical_fov or 90.0) / 2.0)
     rows = keys.matrix or ((f, 0.0, size[0] / 2.0), (0.0, f, size[1] / 2.0), (0.0, 0.0, 1.0))
     K = np.array(rows) if [len(row) for row in rows] == [3, 3, 3] else np.zeros((3, 3))
@@ -295,7 +302,10 @@ def _check(camera: OwnCamera) -> None:
     s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
     far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
     if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
-        raise ValueError(f"distortion {list(camera.distortion)} folds the image before its corners")
+        image = f"an image of {keys.width} × {keys.height} px before its corners"
+        raise ValueError(
+            f"distortion {list(camera.distortion)} folds {image}, with this matrix; take them from one calibration"
+        )
     squares = np.linspace(0.0, math.hypot(*far) ** 2)
     if (moved := np.abs(squares * (k1 + squares * (k2 + squares * k3))).max()) > MAX_MOVED:
         far_away = f"moves points by {moved:.0%} of their distance from the middle"

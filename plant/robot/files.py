@@ -252,7 +252,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
             str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
         ).robot
     except Exception as error:  # noqa: BLE001 - the line repeats any error
-        said.append(str(error) or type(error).__name__)
+        said.append(f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__)
     finally:
         log.removeFilter(collect)
     if said:

@@ -137,7 +137,15 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
     topic = "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [0.12, -0.25, 0.002, -0.001, 0.08]\n"
     topic += "k: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
     named = write(f'intrinsics = "ros.yaml"\nrate = 30\n{ON_FLANGE}', "named.toml")
-    for path in (write(CAMERA), write(ROS, "ros.yaml"), tmp_path / "opencv.yml", write(topic, "topic.yaml"), named):
+    flat = write(CAMERA.replace("[[", "[").replace("]]", "]").replace("], [", ", "), "flat.toml")
+    for path in (
+        write(CAMERA),
+        flat,
+        write(ROS, "ros.yaml"),
+        tmp_path / "opencv.yml",
+        write(topic, "topic.yaml"),
+        named,
+    ):
         text = path.read_text()
         camera = read_camera(named if text == ROS else path)
         np.testing.assert_array_equal(camera.matrix, K)
@@ -154,10 +162,14 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
         ("615.0", "3.6", "a focal length of 3.6 px does not fit"),
         ("322.5", "1200.0", r"the principal point \[1200.0, 238.0\] px must be in the image"),
         ("matrix = ", "matrices = ", "has no setting 'matrices': did you mean 'matrix'"),
-        ("0.12", "-3.0", "folds the image before its corners"),
+        (
+            "0.12",
+            "-3.0",
+            "folds an image of 640 × 480 px before its corners, with this matrix; take them from one calibration",
+        ),
         ("k3", "k4", "distortion has no coefficient 'k4'; wanted plumb_bob with k1, k2, p1, p2, k3"),
         ("height", 'distortion_model = "fisheye"\nheight', "distortion_model 'fisheye' is not known; wanted plumb_bob"),
-        ("[pose]", "vertical_fov = 60.0\n[pose]", "one of matrix .px. and vertical_fov .deg. must be given"),
+        ("[pose]", "vertical_fov = 60.0\n[pose]", "either matrix .px. or vertical_fov .deg. must be given, got both"),
         ("[pose]", "rate = 0.05\n[pose]", "rate must be given in Hz, from 0.5 to 1000, got 0.05"),
         ("[pose]", "latency = 80\n[pose]", "latency must be given in s, from 0 to 5, got 80"),
         ('frame = "flange"', "", 'a place needs frame, "base" or "flange", and position'),

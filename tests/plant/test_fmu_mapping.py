@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from servobench.plant.contract.settings import remark
 from servobench.plant.fmu.description import FmuDescription, Variable
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping, mapping_spec, read_mapping
 
@@ -99,3 +100,13 @@ def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given
         return
     with pytest.raises(ValueError, match=f"names.feature_unit must be {told}, the unit of y, got {given}"):
         mapping_spec(mapping, described, 0.05)
+
+
+def test_features_that_are_the_joints_are_remarked_on(tmp_path, caplog):
+    remark.cache_clear()
+    variables = Variable("v", 0, 1, "input"), Variable("q", 1, 1, "output"), Variable("y", 2, 1, "output")
+    described = FmuDescription(tmp_path / "a.fmu", 2, "a", "a", "", False, False, False, variables)
+    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
+    assert not caplog.text
+    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("q",), joints=("q",)), described, 0.05)
+    assert "features of the mapping are its joints, q;" in caplog.text
