@@ -1,5 +1,6 @@
 """The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -174,8 +175,10 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
         return ""
     names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
     names += [RUNS] if (folder / RUNS).exists() else []
-    intact = [name for name in names if _fault(folder, name) is None]  # the others are made again in any case
-    owners = {tables.owner(folder, name).partition("@")[0] for name in intact}
+    owners = set[str]()
+    for name in names:
+        with contextlib.suppress(DamagedFile):  # which is made again in any case
+            owners.add(tables.owner(folder, name).partition("@")[0])
     if owners - {manifest["campaign"]} or not owners:
         raise ConfigurationError(
             f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "

@@ -15,6 +15,7 @@ from rich.text import Text
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, Observer, Row
 from servobench.harness.cli.terminal import end_interrupted
+from servobench.plant.contract.files import harmless
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
 
@@ -142,7 +143,7 @@ class ConsoleObserver(Observer):
 
     def note(self, text: str) -> None:
         """Print a line."""
-        self._console.print(text, soft_wrap=True)
+        self._console.print(harmless(text), soft_wrap=True, markup=False, highlight=False)
 
     def close(self) -> None:
         """Take line and bar away."""
