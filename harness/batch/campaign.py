@@ -263,8 +263,7 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
             raise ConfigurationError(f"{folder} and {other} have the same runs: leave one away")
     with locked(out):
         results.create_folder(out, manifest)
-        for runs, folder in found:
-            results.copy_part(folder, out, runs.start)
+        results.copy_parts(((folder, runs.start) for runs, folder in found), out)
         return results.put_together(out, manifest)
 
 

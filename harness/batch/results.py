@@ -14,7 +14,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -137,21 +137,26 @@ def part_names(folder: Path, kind: str) -> list[str]:
     return [name for name in names if is_expected(folder, name)]
 
 
-def copy_part(folder: Path, other: Path, index: int) -> None:
-    """Copy the part that begins with the run `index`, and the pictures of its runs, into another folder.
+def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
+    """Copy parts, each of a folder and beginning with a run, and the pictures of their runs into another folder.
 
     Raises:
-        ConfigurationError: a file of it is damaged.
+        ConfigurationError: a file of them is damaged.
         UnwritableFolder: the other folder takes no more files.
     """
-    names = [name for name in (part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)) if is_expected(folder, name)]
-    _refuse_damaged(folder, names)
-    runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
-    pictures = [name for name in (f"{PICTURES}/{run}.png" for run in runs) if (folder / name).is_file()]
+    files: dict[str, Callable[[Path], object]] = {}
+    for folder, index in parts:
+        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
+        names = [name for name in names if is_expected(folder, name)]
+        _refuse_damaged(folder, names)
+        if (folder / PICTURES).is_dir():
+            runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
+            names = [name for run in runs if (folder / (name := f"{PICTURES}/{run}.png")).is_file()] + names
+        files |= {name: partial(shutil.copyfile, folder / name) for name in names}
     with writing(other):
-        if pictures:
+        if any(name.startswith(PICTURES) for name in files):
             (other / PICTURES).mkdir(exist_ok=True)
-        write_vouched(other, {name: partial(shutil.copyfile, folder / name) for name in [*pictures, *names]})
+        write_vouched(other, files)
 
 
 def finished_runs(folder: Path) -> list[range]:
