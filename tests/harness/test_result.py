@@ -219,7 +219,7 @@ TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in ra
         ),
         (LOOK, "{'error': np.zeros(3)}", "diagnostics must hold numbers, got 'error': ndarray of shape (3,)"),
         (LOOK, "{'state': 'good'}", "diagnostics must hold numbers, got 'state': str"),
-        (LOOK, "{3: 1.0}", "diagnostics must have texts as names, got 3"),
+        (LOOK, "{3: 1.0}", "diagnostics must have texts of one line and at most 100 letters as names, got 3"),
         (
             "estimated_jacobian(self)",
             "np.zeros((6, 3))",
