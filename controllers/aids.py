@@ -22,30 +22,19 @@ Mark = TypeVar("Mark")
 
 @dataclass(frozen=True)
 class Switch:
-    """Declares a setting that switches an aid; its default leaves the aid out.
+    """Declares a setting that switches an aid; its default leaves the aid out."""
 
-    Attributes:
-        equipped: its value in a best equipped method.
-        tuned: the values among which tuning chooses; empty where tuning has no choice.
-    """
-
-    equipped: object
-    tuned: tuple[object, ...] = ()
+    equipped: object  # its value in a best equipped method
+    tuned: tuple[object, ...] = ()  # the values among which tuning chooses; empty where tuning has no choice
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Declares the range in which a number is tuned.
+    """Declares the range in which a number is tuned."""
 
-    Attributes:
-        low: smallest value.
-        high: largest value.
-        log: whether it is searched by factor.
-    """
-
-    low: float
-    high: float
-    log: bool = False
+    low: float  # smallest value
+    high: float  # largest value
+    log: bool = False  # whether it is searched by factor
 
 
 @settings

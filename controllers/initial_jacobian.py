@@ -98,27 +98,16 @@ class KnownJacobian(InitialJacobian[FloatArray]):
 
 
 class ProbeState(NamedTuple):
-    """Progress of the probing.
+    """Progress of the probing."""
 
-    Attributes:
-        rests: (...), rests that are over, the start included.
-        rest_positions: (..., n+1, n) [rad], mean joint positions of the rests.
-        rest_features: (..., n+1, m), mean features of the rests.
-        gathered: (...), observations gathered at the present rest.
-        positions: (..., a, n) [rad], their joint positions.
-        features: (..., a, m), their features.
-        phase: (...) [periods] since the present move began.
-        rest_begins: (...) [periods] duration of the present move.
-    """
-
-    rests: IntArray
-    rest_positions: FloatArray
-    rest_features: FloatArray
-    gathered: IntArray
-    positions: FloatArray
-    features: FloatArray
-    phase: IntArray
-    rest_begins: IntArray
+    rests: IntArray  # (...), rests that are over, the start included
+    rest_positions: FloatArray  # (..., n+1, n) [rad], mean joint positions of the rests
+    rest_features: FloatArray  # (..., n+1, m), mean features of the rests
+    gathered: IntArray  # (...), observations gathered at the present rest
+    positions: FloatArray  # (..., a, n) [rad], their joint positions
+    features: FloatArray  # (..., a, m), their features
+    phase: IntArray  # (...) [periods] since the present move began
+    rest_begins: IntArray  # (...) [periods] duration of the present move
 
 
 @final

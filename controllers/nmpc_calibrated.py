@@ -8,13 +8,7 @@ import casadi
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, Delays, Diagnostics, RobotKnowledge
-from servobench.controllers.laws.mpc.closed_form import (
-    Blocks,
-    bridging_shares,
-    decay_shares,
-    decay_targets,
-    move_weights,
-)
+from servobench.controllers.laws.mpc import closed_form
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
 from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
@@ -92,7 +86,7 @@ class NmpcCalibrated(Controller):
         """
         knowledge = in_natural_units(knowledge)
         period = knowledge.spec.period
-        blocks = Blocks.of(config.horizon_time, config.moves, period)
+        blocks = closed_form.Blocks.of(config.horizon_time, config.moves, period)
         self._taps = zero_vibration_taps(*knowledge.true_tool, period) if config.image else np.ones(1)
         delay = config.delay + period * float(np.arange(len(self._taps)) @ self._taps)
         reach = blocks.count * blocks.length + delay
@@ -103,16 +97,16 @@ class NmpcCalibrated(Controller):
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
         self._blocks, self._places = blocks, blocks.places(delay)
-        self._to_come = shaped_shares(bridging_shares(config.delay, period), self._taps)
+        self._to_come = shaped_shares(closed_form.bridging_shares(config.delay, period), self._taps)
         self._along_plan = self._model.map(blocks.count)
-        self._shares = decay_shares(blocks.count, config.decay * blocks.length)
+        self._shares = closed_form.decay_shares(blocks.count, config.decay * blocks.length)
         ages = exposure_ages(knowledge.true_delays or Delays(0.0, 0.0, 0.0), period)
         self._reach = math.ceil(ages[-1])  # periods of the past in which frames were exposed
         self._exposures = self._reach - ages
         self._change: FloatArray = np.full(n, config.joint_acceleration_limit * blocks.length)
         limited = math.isfinite(config.joint_acceleration_limit)
         self._shape = QpShape(
-            weights=move_weights(blocks.count, 1.0, config.terminal_weight / blocks.relative_length),
+            weights=closed_form.move_weights(blocks.count, 1.0, config.terminal_weight / blocks.relative_length),
             move_weight=np.full(n, config.move_weight / blocks.relative_length**2),
             constant_gain=None,
             largest_move=self._spec.joint_velocity_limit * blocks.length,
@@ -158,7 +152,7 @@ class NmpcCalibrated(Controller):
         places: FloatArray = self._spec.period * np.arange(float(len(reference)))
         rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
-        wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
+        wanted = rows[0] - error + closed_form.decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
         plan, success = self._improve(start, wanted)
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan[0] / self._blocks.length, -limit, limit) if success else np.zeros(self._spec.n)

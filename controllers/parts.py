@@ -4,17 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from servobench.controllers.estimators import correntropy
 from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
-from servobench.controllers.estimators.correntropy import (
-    GmckfConfig,
-    ImcckfConfig,
-    MckfConfig,
-    RmckfConfig,
-    gmckf_estimator,
-    imcckf_estimator,
-    mckf_estimator,
-    rmckf_estimator,
-)
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
 from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator, CfdlConfig, CfdlEstimator
@@ -53,10 +44,10 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
     "ukf": Part(UkfConfig, ukf_estimator),
     "kalman": Part(KalmanConfig, kalman_estimator),
-    "mckf": Part(MckfConfig, mckf_estimator),
-    "imcckf": Part(ImcckfConfig, imcckf_estimator),
-    "gmckf": Part(GmckfConfig, gmckf_estimator),
-    "rmckf": Part(RmckfConfig, rmckf_estimator),
+    "mckf": Part(correntropy.MckfConfig, correntropy.mckf_estimator),
+    "imcckf": Part(correntropy.ImcckfConfig, correntropy.imcckf_estimator),
+    "gmckf": Part(correntropy.GmckfConfig, correntropy.gmckf_estimator),
+    "rmckf": Part(correntropy.RmckfConfig, correntropy.rmckf_estimator),
     "robust": Part(RobustConfig, RobustEstimator),
     "broyden": Part(BroydenConfig, BroydenEstimator),
     "rls": Part(RlsConfig, RlsEstimator),

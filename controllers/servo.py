@@ -26,23 +26,14 @@ from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 
 class ServoState(NamedTuple):
-    """The state of a composed controller.
+    """The state of a composed controller."""
 
-    Attributes:
-        estimation: of the pair and estimate stages.
-        law: of the law.
-        initial: of the provider of the initial Jacobian.
-        predictor: of the predict stage; None without one.
-        ready: (...), whether the initial Jacobian is known.
-        limited: (...), whether the last command was limited.
-    """
-
-    estimation: EstimationState
-    law: Any
-    initial: Any
-    predictor: Any
-    ready: BoolArray
-    limited: BoolArray
+    estimation: EstimationState  # of the pair and estimate stages
+    law: Any  # of the law
+    initial: Any  # of the provider of the initial Jacobian
+    predictor: Any  # of the predict stage; None without one
+    ready: BoolArray  # (...), whether the initial Jacobian is known
+    limited: BoolArray  # (...), whether the last command was limited
 
     @property
     def jacobian(self) -> FloatArray:

@@ -27,21 +27,13 @@ class CompilationFailed(ValueError):
 
 @dataclass(frozen=True)
 class Platform:
-    """A combination of processor and operating system.
+    """A combination of processor and operating system."""
 
-    Attributes:
-        name: platform tuple of FMI 3.0.
-        fmi2_folder: its name in FMI 2.0.
-        suffix: file name suffix of shared libraries.
-        zig_target: its name in zig.
-        flags: compiler flags.
-    """
-
-    name: str
-    fmi2_folder: str
-    suffix: str
-    zig_target: str
-    flags: tuple[str, ...] = ()
+    name: str  # platform tuple of FMI 3.0
+    fmi2_folder: str  # its name in FMI 2.0
+    suffix: str  # file name suffix of shared libraries
+    zig_target: str  # its name in zig
+    flags: tuple[str, ...] = ()  # compiler flags
 
     def folder(self, fmi_version: int) -> str:
         """Return the folder below binaries/ of an FMU."""

@@ -43,25 +43,15 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
 
 @dataclass(frozen=True)
 class ControllerModel:
-    """A controller ready for export.
+    """A controller ready for export."""
 
-    Attributes:
-        name: by which it is known.
-        summary: one line.
-        recorded: its step, of the columns [time, inputs].
-        groups: from `controller_groups`.
-        period: s.
-        run: of the original, with its outputs for the inputs at the same time.
-        settings: of the original, for the documentation.
-    """
-
-    name: str
-    summary: str
-    recorded: Recorded
-    groups: tuple[Group, ...]
-    period: float
-    run: ReferenceRun
-    settings: str
+    name: str  # by which it is known
+    summary: str  # one line
+    recorded: Recorded  # its step, of the columns [time, inputs]
+    groups: tuple[Group, ...]  # from `controller_groups`
+    period: float  # s
+    run: ReferenceRun  # of the original, with its outputs for the inputs at the same time
+    settings: str  # of the original, for the documentation
 
     @property
     def identifier(self) -> str:

@@ -133,31 +133,18 @@ def _section(layout: Layout, fmi2: str, fmi3: str, rows: _Rows) -> Section:
 
 @dataclass(frozen=True)
 class Description:
-    """Content of a model description.
+    """Content of a model description."""
 
-    Attributes:
-        model_name: display name.
-        model_identifier: file name of the libraries.
-        summary: one sentence.
-        layout: the variables.
-        sections: of the model structure.
-        start: start values of parameters and inputs, flat arrays by group; zero where there are none.
-        sources: C files to compile, in order.
-        tool: name and version of the exporter.
-        step: of the default experiment [s].
-        exchange: whether there is model exchange, with derivatives, beside co-simulation.
-    """
-
-    model_name: str
-    model_identifier: str
-    summary: str
-    layout: Layout
-    sections: tuple[Section, ...]
-    start: Mapping[str, FloatArray]
-    sources: tuple[str, ...]
-    tool: str
-    step: float = 0.05
-    exchange: bool = True
+    model_name: str  # display name
+    model_identifier: str  # file name of the libraries
+    summary: str  # one sentence
+    layout: Layout  # the variables
+    sections: tuple[Section, ...]  # of the model structure
+    start: Mapping[str, FloatArray]  # start values of parameters and inputs, flat arrays by group; else zero
+    sources: tuple[str, ...]  # C files to compile, in order
+    tool: str  # name and version of the exporter
+    step: float = 0.05  # of the default experiment [s]
+    exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
 
 
 def write_description(description: Description, version: int, token: str) -> bytes:

@@ -48,27 +48,16 @@ RELATED_FILES: Final = (
 
 @dataclass(frozen=True)
 class Product:
-    """The content of an FMU.
+    """The content of an FMU."""
 
-    Attributes:
-        fmi_version: 2 or 3.
-        folder: of the model below `fmus`, with model.c, model.h and license.txt.
-        core: name of the generated C file and of its header in that folder.
-        source: text of that C file.
-        constants: for layout.h, beside sizes and offsets of the variables.
-        description: of the model.
-        documentation: HTML.
-        reference: text of the reference run's inputs and outputs.
-    """
-
-    fmi_version: int
-    folder: str
-    core: str
-    source: str
-    constants: Mapping[str, float]
-    description: Description
-    documentation: str
-    reference: tuple[str, str]
+    fmi_version: int  # 2 or 3
+    folder: str  # of the model below `fmus`, with model.c, model.h and license.txt
+    core: str  # name of the generated C file and of its header in that folder
+    source: str  # text of that C file
+    constants: Mapping[str, float]  # for layout.h, beside sizes and offsets of the variables
+    description: Description  # of the model
+    documentation: str  # HTML
+    reference: tuple[str, str]  # text of the reference run's inputs and outputs
 
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""

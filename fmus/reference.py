@@ -23,17 +23,11 @@ COMMAND = "joint_velocity_command"
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """Inputs, each held over the step that begins at its time, and the outputs at those times.
+    """Inputs, each held over the step that begins at its time, and the outputs at those times."""
 
-    Attributes:
-        time: (k,), s.
-        inputs: by name, (k, size).
-        outputs: by name, (k, size).
-    """
-
-    time: FloatArray
-    inputs: Mapping[str, FloatArray]
-    outputs: Mapping[str, FloatArray]
+    time: FloatArray  # (k,), s
+    inputs: Mapping[str, FloatArray]  # by name, (k, size)
+    outputs: Mapping[str, FloatArray]  # by name, (k, size)
 
     def tables(self, layout: Layout) -> tuple[str, str]:
         """Return inputs and outputs as CSV."""

@@ -14,6 +14,7 @@ from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
@@ -108,10 +109,8 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     """
     model, _ = setup.robot()
     sensing = Sensing(model.setup, model.mount) if isinstance(model, SetupModel) else None
-    try:
+    with configuration_errors("the FMU cannot be built: "):
         path = cached_fmu(config.fmi_version, setup.nominal, sensing)
-    except ValueError as error:
-        raise ValueError(f"the FMU cannot be built: {error}") from error
     lag = float(np.mean(config.joint_lags or config.lag))
     bench = build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model)
     bench.world.mechanics = config.mechanics

@@ -33,25 +33,15 @@ SEEN: Final = "seen"
 
 @dataclass(frozen=True)
 class Group:
-    """One variable of the model.
+    """One variable of the model."""
 
-    Attributes:
-        name: as FMI 3 shows it.
-        shape: sizes of its axes.
-        role: one of the roles above; a fixed parameter holds from the end of initialisation on.
-        unit: as in the description; "1" for none.
-        description: one sentence.
-        minimum: smallest admissible value, or None.
-        nominal: usual size of a value, for a solver's tolerances, or None.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    role: str
-    unit: str
-    description: str
-    minimum: float | None = None
-    nominal: float | None = None
+    name: str  # as FMI 3 shows it
+    shape: tuple[int, ...]  # sizes of its axes
+    role: str  # one of the roles above; a fixed parameter holds from the end of initialisation on
+    unit: str  # as in the description; "1" for none
+    description: str  # one sentence
+    minimum: float | None = None  # smallest admissible value, or None
+    nominal: float | None = None  # usual size of a value, for a solver's tolerances, or None
 
     @property
     def size(self) -> int:
@@ -70,18 +60,12 @@ class View(NamedTuple):
     """The part of a sensing set-up that the equations fix; all else is a parameter.
 
     A set-up takes the place of the ball, its fixed camera and its position in the table of variables.
-
-    Attributes:
-        setup: the set-up.
-        mount: of its cameras.
-        size: width and height of the images [px].
-        calibrated: whether the cameras have all coefficients of OpenCV's model and two focal lengths.
     """
 
-    setup: SensingSetup
-    mount: Mount
-    size: tuple[float, float]
-    calibrated: bool
+    setup: SensingSetup  # the set-up
+    mount: Mount  # of its cameras
+    size: tuple[float, float]  # width and height of the images [px]
+    calibrated: bool  # whether the cameras have all coefficients of OpenCV's model and two focal lengths
 
     @classmethod
     def of(cls, model: SetupModel) -> Self:
@@ -195,13 +179,9 @@ def _ball_outputs(n: int) -> tuple[Group, ...]:
 
 @dataclass(frozen=True)
 class Layout:
-    """The groups and their offsets in the flat vector of values.
+    """The groups and their offsets in the flat vector of values."""
 
-    Attributes:
-        groups: of the model.
-    """
-
-    groups: tuple[Group, ...]
+    groups: tuple[Group, ...]  # of the model
 
     @cached_property
     def offsets(self) -> dict[str, int]:
@@ -224,13 +204,9 @@ class Layout:
 
 @dataclass(frozen=True)
 class ArmLayout(Layout):
-    """The layout of an arm.
+    """The layout of an arm."""
 
-    Attributes:
-        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
-    """
-
-    view: View | None = None
+    view: View | None = None  # of a sensing set-up; None for the ball in 3-D by a fixed camera
 
     @property
     def kinematic(self) -> tuple[Group, ...]:
@@ -247,25 +223,15 @@ class ArmLayout(Layout):
 
 @dataclass(frozen=True)
 class Actuation:
-    """Parameters of the model other than its geometry.
+    """Parameters of the model other than its geometry."""
 
-    Attributes:
-        lag: time constant of the velocity loops [s], one for all joints or (n,).
-        max_speed: limit of the joint speeds [rad/s].
-        joint_range: distance of the stops from zero [rad].
-        home: (..., n) reported joint positions at the start [rad].
-        encoder_resolution: step of the encoders [rad], one for all joints or (n,); 0 for exact ones.
-        limits: of the arm's maker, which hold as well; None for none.
-        mechanics: gears and tool.
-    """
-
-    lag: float | FloatArray
-    max_speed: float
-    joint_range: float
-    home: FloatArray
-    encoder_resolution: float | FloatArray = 0.0
-    limits: JointLimits | None = None
-    mechanics: MechanicsConfig = RIGID
+    lag: float | FloatArray  # time constant of the velocity loops [s], one for all joints or (n,)
+    max_speed: float  # limit of the joint speeds [rad/s]
+    joint_range: float  # distance of the stops from zero [rad]
+    home: FloatArray  # (..., n) reported joint positions at the start [rad]
+    encoder_resolution: float | FloatArray = 0.0  # step of the encoders [rad], one for all or (n,); 0 for exact ones
+    limits: JointLimits | None = None  # of the arm's maker, which hold as well; None for none
+    mechanics: MechanicsConfig = RIGID  # gears and tool
 
     def stops(self, n: int) -> JointLimits:
         """Return speeds and stops of `n` joints."""

@@ -95,23 +95,14 @@ def follow_with_overshoot(
 
 
 class KinematicState(NamedTuple):
-    """The state of the world, whose arrays never change.
+    """The state of the world, whose arrays never change."""
 
-    Attributes:
-        model: arm and camera as they are now.
-        q: (..., n), rad.
-        v: (..., n), rad/s.
-        a: (..., n), rad/s², of joints with overshoot; else 0.
-        x: (..., n), rad, behind the gears.
-        tool: of a flexible tool.
-    """
-
-    model: RobotModel
-    q: FloatArray
-    v: FloatArray
-    a: FloatArray
-    x: FloatArray
-    tool: Tool
+    model: RobotModel  # arm and camera as they are now
+    q: FloatArray  # (..., n), rad
+    v: FloatArray  # (..., n), rad/s
+    a: FloatArray  # (..., n), rad/s², of joints with overshoot; else 0
+    x: FloatArray  # (..., n), rad, behind the gears
+    tool: Tool  # of a flexible tool
 
 
 class KinematicWorld(World):

@@ -70,19 +70,12 @@ def corrected(
 
 
 class Iterate(NamedTuple):
-    """A step of the fixed-point iteration.
+    """A step of the fixed-point iteration."""
 
-    Attributes:
-        J: the present Ĵ, (..., m, n), m/rad.
-        gain: K of each row, (..., m, n), rad⁻¹.
-        prior: error of the prior as B⁻¹ (J⁻ − J), (..., m, n), 1.
-        moves: (...), whether Ĵ changed by more than the tolerance.
-    """
-
-    J: FloatArray
-    gain: FloatArray
-    prior: FloatArray
-    moves: BoolArray
+    J: FloatArray  # the present Ĵ, (..., m, n), m/rad
+    gain: FloatArray  # K of each row, (..., m, n), rad⁻¹
+    prior: FloatArray  # error of the prior as B⁻¹ (J⁻ − J), (..., m, n), 1
+    moves: BoolArray  # (...), whether Ĵ changed by more than the tolerance
 
 
 def fixed_point_update(

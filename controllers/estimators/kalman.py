@@ -143,17 +143,11 @@ Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
 
 
 class WalkState(NamedTuple):
-    """The state of a filter.
+    """The state of a filter."""
 
-    Attributes:
-        J: Ĵ, (..., m, n), m/rad.
-        P: covariance, (m/rad)²; see `Covariance`.
-        updated: (...), whether the last motion was used.
-    """
-
-    J: FloatArray
-    P: FloatArray
-    updated: BoolArray
+    J: FloatArray  # Ĵ, (..., m, n), m/rad
+    P: FloatArray  # covariance, (m/rad)²; see `Covariance`
+    updated: BoolArray  # (...), whether the last motion was used
 
 
 @final

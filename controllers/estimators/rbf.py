@@ -73,25 +73,15 @@ def started_rows(network: JacobianNetwork, jacobian: FloatArray) -> FloatArray:
 
 
 class RbfState(NamedTuple):
-    """The state of the update; the window holds the T − 1 motions before the next one, the newest last.
+    """The state of the update; the window holds the T − 1 motions before the next one, the newest last."""
 
-    Attributes:
-        rows: W by rows of the Jacobian, (..., m, n, L), m/rad.
-        theta: θ of the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two.
-        joint_steps: Δq of the window, (..., T−1, n), rad.
-        feature_steps: Δy of the window, (..., T−1, m), m.
-        filled: how many motions there are, (...).
-        errors: Δy_t − Ĵ_t Δq_t of the last update, (..., T, m), m.
-        step: α₂ of the last update, (...).
-    """
-
-    rows: FloatArray
-    theta: FloatArray
-    joint_steps: FloatArray
-    feature_steps: FloatArray
-    filled: npt.NDArray[np.int_]
-    errors: FloatArray
-    step: FloatArray
+    rows: FloatArray  # W by rows of the Jacobian, (..., m, n, L), m/rad
+    theta: FloatArray  # θ of the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two
+    joint_steps: FloatArray  # Δq of the window, (..., T−1, n), rad
+    feature_steps: FloatArray  # Δy of the window, (..., T−1, m), m
+    filled: npt.NDArray[np.int_]  # how many motions there are, (...)
+    errors: FloatArray  # Δy_t − Ĵ_t Δq_t of the last update, (..., T, m), m
+    step: FloatArray  # α₂ of the last update, (...)
 
 
 @final

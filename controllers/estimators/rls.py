@@ -6,17 +6,16 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 λ = 1 is batch least squares.
 """
 
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import cholesky_of
+from servobench.controllers.estimators.kalman import WalkState, cholesky_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, outer, transposed
 from servobench.plant.contract.settings import NonNegative, Positive, PositiveOrInfinite, settings
-from servobench.plant.contract.signals import BoolArray
 
 
 @settings
@@ -63,16 +62,8 @@ def rls_update(
     return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
 
 
-class RlsState(NamedTuple):
-    """Ĵ, (..., m, n), m/rad; P, (..., n, n), 1/rad²; and whether the last motion was used, (...)."""
-
-    J: FloatArray
-    P: FloatArray
-    updated: BoolArray
-
-
 @final
-class RlsEstimator(Estimator[RlsState]):
+class RlsEstimator(Estimator[WalkState]):
     """Ĵ ← Ĵ + (Δy − ĴΔq) Kᵀ with forgetting λ; motions below a minimum ‖Δq‖ are left out.
 
     Forgetting inflates P in directions in which nothing moves, without bound. So P is scaled back to a mean diagonal
@@ -83,13 +74,13 @@ class RlsEstimator(Estimator[RlsState]):
         """Take the settings; nothing about the robot is needed."""
         self._config = config
 
-    def start(self, jacobian: FloatArray) -> RlsState:
-        """Start from Ĵ₀, (..., m, n), m/rad."""
+    def start(self, jacobian: FloatArray) -> WalkState:
+        """Start from Ĵ₀, (..., m, n), m/rad, with P (..., n, n), 1/rad²."""
         lead, n = jacobian.shape[:-2], jacobian.shape[-1]
         P = np.broadcast_to(np.eye(n) * self._config.initial_covariance, (*lead, n, n))
-        return RlsState(jacobian, P, np.full(lead, False))
+        return WalkState(jacobian, P, np.full(lead, False))
 
-    def update(self, state: RlsState, motion: Motion) -> RlsState:
+    def update(self, state: WalkState, motion: Motion) -> WalkState:
         """Correct by one motion.
 
         Raises:
@@ -98,14 +89,14 @@ class RlsEstimator(Estimator[RlsState]):
         large = norm(motion.joint_step) >= self._config.min_joint_step
         return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def _correct(self, state: RlsState, motion: Motion) -> RlsState:
+    def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
         J, P = rls_update(state.J, state.P, dq, dy, forgetting=np.exp(-np.asarray(motion.duration) / config.memory))
         P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
         cholesky_of(P)
         return state._replace(J=J, P=P)
 
-    def diagnostics(self, state: RlsState) -> Diagnostics:
+    def diagnostics(self, state: WalkState) -> Diagnostics:
         """Return whether the last motion was used and the mean of P's diagonal, 1/rad²."""
         return {"estimator_updated": state.updated, "covariance_mean": _mean_diagonal(state.P)}
 

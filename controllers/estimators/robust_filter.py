@@ -56,21 +56,13 @@ class RobustConfig(RandomWalk):
 
 
 class RobustState(NamedTuple):
-    """The state of the filter.
+    """The state of the filter."""
 
-    Attributes:
-        J: Ĵ, (..., m, n), m/rad.
-        P: covariance of [y_i, J_i] of each feature, (..., m, 1 + n, 1 + n), m² and (m/rad)².
-        deviation: measured − estimated feature of the last frame, (..., m), m.
-        scale: s, (...), 1.
-        rejected: share of rejections of each feature, (..., m), with forgetting.
-    """
-
-    J: FloatArray
-    P: FloatArray
-    deviation: FloatArray
-    scale: FloatArray
-    rejected: FloatArray
+    J: FloatArray  # Ĵ, (..., m, n), m/rad
+    P: FloatArray  # covariance of [y_i, J_i] of each feature, (..., m, 1 + n, 1 + n), m² and (m/rad)²
+    deviation: FloatArray  # measured − estimated feature of the last frame, (..., m), m
+    scale: FloatArray  # s, (...), 1
+    rejected: FloatArray  # share of rejections of each feature, (..., m), with forgetting
 
 
 def bisquare_weight(residual: FloatArray) -> FloatArray:

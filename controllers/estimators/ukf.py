@@ -20,20 +20,14 @@ from typing import Literal
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.kalman import (
-    RandomWalk,
-    RandomWalkEstimator,
-    cholesky_of,
-    full_covariances,
-    split_update,
-)
+from servobench.controllers.estimators import kalman
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import transposed
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 
 @settings
-class UkfConfig(RandomWalk):
+class UkfConfig(kalman.RandomWalk):
     """Settings of the unscented Kalman filter."""
 
     alpha: Positive = 1.0
@@ -48,17 +42,11 @@ class UkfConfig(RandomWalk):
 
 @dataclass(frozen=True, eq=False)
 class SigmaWeights:
-    """Weights of the scaled sigma points.
+    """Weights of the scaled sigma points."""
 
-    Attributes:
-        reach: √(s + Λ), how many deviations the points stand off.
-        mean: wᵐ, (2s+1,).
-        covariance: wᶜ, (2s+1,).
-    """
-
-    reach: float
-    mean: FloatArray
-    covariance: FloatArray
+    reach: float  # √(s + Λ), how many deviations the points stand off
+    mean: FloatArray  # wᵐ, (2s+1,)
+    covariance: FloatArray  # wᶜ, (2s+1,)
 
 
 @cache
@@ -101,7 +89,7 @@ def unscented_update(
     """
     *lead, m, n = J.shape
     size, P = m * n, P + Q
-    reach = weights.reach * transposed(cholesky_of(P))
+    reach = weights.reach * transposed(kalman.cholesky_of(P))
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
     Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])  # a point is m rows of J
@@ -115,19 +103,19 @@ def unscented_update(
     return J + np.matvec(K, feature_step - z).reshape(J.shape), (P + transposed(P)) / 2
 
 
-def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> kalman.RandomWalkEstimator:
     """Return the random-walk estimator whose gain is that of the unscented transform.
 
     The paper gives neither P₀, Q and R nor a rule for an arm at rest; here R is the variance 2σ² of the feature's
     noise, and motions below a minimum ‖Δq‖ are left out.
     """
     if config.form == "split":
-        return RandomWalkEstimator(config, split_update, "shared")
+        return kalman.RandomWalkEstimator(config, kalman.split_update, "shared")
 
     def update(
         J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         weights = sigma_weights(P.shape[-1], config.alpha, config.beta, config.kappa)
-        return unscented_update(J, P, joint_step, feature_step, **full_covariances(J, q, r), weights=weights)
+        return unscented_update(J, P, joint_step, feature_step, **kalman.full_covariances(J, q, r), weights=weights)
 
-    return RandomWalkEstimator(config, update, "full")
+    return kalman.RandomWalkEstimator(config, update, "full")

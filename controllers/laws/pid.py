@@ -41,21 +41,13 @@ class PidConfig:
 
 
 class PidState(NamedTuple):
-    """The state of the law.
+    """The state of the law."""
 
-    Attributes:
-        integral: I, (..., m), m s.
-        derivative: d, (..., m), m/s.
-        last_error: e of the last valid feature, (..., m), m.
-        started: (...), whether there was a valid feature.
-        integral_before: I of the period before, (..., m), m s.
-    """
-
-    integral: FloatArray
-    derivative: FloatArray
-    last_error: FloatArray
-    started: BoolArray
-    integral_before: FloatArray
+    integral: FloatArray  # I, (..., m), m s
+    derivative: FloatArray  # d, (..., m), m/s
+    last_error: FloatArray  # e of the last valid feature, (..., m), m
+    started: BoolArray  # (...), whether there was a valid feature
+    integral_before: FloatArray  # I of the period before, (..., m), m s
 
 
 @final

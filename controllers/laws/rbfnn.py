@@ -45,21 +45,13 @@ class RbfnnConfig:
 
 
 class RbfnnState(NamedTuple):
-    """The state of the law.
+    """The state of the law."""
 
-    Attributes:
-        learned: W − W(0), (..., n, p, N_h).
-        errors: e, the newest one first, a row for each control period, (..., rows, m), m; NaN before the first command.
-        positions: q, likewise, (..., rows, n), rad.
-        predicted: e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them.
-        step_size: α of the last update, (...).
-    """
-
-    learned: FloatArray
-    errors: FloatArray
-    positions: FloatArray
-    predicted: FloatArray
-    step_size: FloatArray
+    learned: FloatArray  # W − W(0), (..., n, p, N_h)
+    errors: FloatArray  # e, the newest first, a row for each period, (..., rows, m), m; NaN before the first command
+    positions: FloatArray  # q, likewise, (..., rows, n), rad
+    predicted: FloatArray  # e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them
+    step_size: FloatArray  # α of the last update, (...)
 
 
 @final

@@ -21,19 +21,12 @@ from servobench.plant.contract.lanes import transposed
 
 
 class RollOut(NamedTuple):
-    """The trajectory of the predicted loop.
+    """The trajectory of the predicted loop."""
 
-    Attributes:
-        errors: e(k+1) … e(k+T), (..., T, m), m.
-        xi: ξ(k) … ξ(k+T−1), (..., T, p).
-        h: h(k) … h(k+T−1), (..., T, N_h).
-        wanted: ψ(ξ) ξ less `ControllerNetwork.origin`, (..., n), rad, the first joint step before it is limited.
-    """
-
-    errors: FloatArray
-    xi: FloatArray
-    h: FloatArray
-    wanted: FloatArray
+    errors: FloatArray  # e(k+1) … e(k+T), (..., T, m), m
+    xi: FloatArray  # ξ(k) … ξ(k+T−1), (..., T, p)
+    h: FloatArray  # h(k) … h(k+T−1), (..., T, N_h)
+    wanted: FloatArray  # ψ(ξ) ξ less `ControllerNetwork.origin`, (..., n), rad, the first step before its limit
 
 
 def roll_out(

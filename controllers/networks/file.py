@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, Kernel
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import write_atomically
 
 FORMAT = "servobench networks"
@@ -77,10 +78,8 @@ def load_networks(path: Path, digest: str | None = None) -> TrainedNetworks:
         ValueError: missing, corrupt, foreign, of another format version, or of another robot or configuration.
     """
     arrays = _read_arrays(path)
-    try:
+    with configuration_errors(f"network file {path} is corrupt: ", KeyError, TypeError):
         networks = _from_arrays(arrays)
-    except (KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"network file {path} is corrupt: {error}") from error
     if digest is not None and digest != networks.digest:
         raise ValueError(
             f"network file {path} is of another robot or configuration: training digest {networks.digest}, "

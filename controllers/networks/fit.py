@@ -27,15 +27,9 @@ import numpy as np
 
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.networks import rbf
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, Placement, TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import (
-    ControllerNetwork,
-    JacobianNetwork,
-    hidden_features,
-    information_vector,
-    jacobian_features,
-)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
@@ -89,21 +83,13 @@ def joint_samples(unit: FloatArray, lower: FloatArray, upper: FloatArray) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class ControllerSamples:
-    """Samples to which the controller network is fitted.
+    """Samples to which the controller network is fitted."""
 
-    Attributes:
-        xi: ξ, (S, p), m and rad.
-        error: e(k), (S, m), m.
-        position: q(k−1), (S, n), rad.
-        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m; with little in directions in which joints hardly move the feature.
-        posture_step: K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
-    """
-
-    xi: FloatArray
-    error: FloatArray
-    position: FloatArray
-    gain: FloatArray
-    posture_step: FloatArray
+    xi: FloatArray  # ξ, (S, p), m and rad
+    error: FloatArray  # e(k), (S, m), m
+    position: FloatArray  # q(k−1), (S, n), rad
+    gain: FloatArray  # K_p s J⁺ at q(k−1), (S, n, m), rad/m; little where joints hardly move the feature
+    posture_step: FloatArray  # K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y
 
     @property
     def command(self) -> FloatArray:
@@ -148,7 +134,7 @@ def controller_samples(
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
     proportional, posture = plan.gain * plan.step, posture_gain * plan.step
-    return ControllerSamples(information_vector(errors, positions), error, q, proportional * pinv, posture * free)
+    return ControllerSamples(rbf.information_vector(errors, positions), error, q, proportional * pinv, posture * free)
 
 
 def train(
@@ -188,7 +174,10 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
     """
     if not config.lower:
         if knowledge.region is None:
-            raise ValueError("training needs a region: give lower and upper, one number a joint, rad")
+            needed = (
+                "lower and upper, one number a joint, rad, and a nominal model, such as nominal in an FMU's mapping"
+            )
+            raise ValueError(f"training needs a region and a model of the robot: give {needed}")
         lower, upper = knowledge.region
         config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
     spec = knowledge.spec
@@ -197,7 +186,9 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
     elif knowledge.nominal_jacobian is not None:
         networks = train(config, knowledge.nominal_jacobian, spec)
     else:
-        raise ValueError("training needs a nominal model, and this plant has none")
+        raise ValueError(
+            "training needs a nominal model, and this plant has none; an FMU gets one by nominal in its mapping"
+        )
     if (networks.jacobian.n, networks.jacobian.m) != (spec.n, spec.m):
         raise ValueError(
             f"network must be of {spec.n} joints and {spec.m} features, "
@@ -226,7 +217,7 @@ def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, 
 
 def _train_jacobian(
     config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
-) -> tuple[JacobianNetwork, float]:
+) -> tuple[rbf.JacobianNetwork, float]:
     """Return the Jacobian network and its held-out error, the RMS of ‖Ĵ − J‖ over that of ‖J‖."""
     plan: JacobianTraining = config.jacobian
     lower, upper = config.region(spec.n)
@@ -243,20 +234,20 @@ def _train_jacobian(
     widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
     for index, scale in enumerate(plan.width_scales):
         report(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
-        theta = jacobian_features(q, centres[None], np.full((1, plan.centres), scale * spread))[:, 0]
+        theta = rbf.jacobian_features(q, centres[None], np.full((1, plan.centres), scale * spread))[:, 0]
         for W in ridge_path(theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations):
             residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
             square = np.einsum("smn,smn->n", residual, residual)
             for i in np.flatnonzero(square < squares):
                 squares[i], widths[i] = square[i], scale * spread
                 weights[i] = W.reshape(plan.centres, spec.m, spec.n)[:, :, i].T
-    network = JacobianNetwork(np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights)
+    network = rbf.JacobianNetwork(np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights)
     return network, float(np.sqrt(squares.sum() / np.einsum("smn,smn->", J[:held], J[:held])))
 
 
 def _train_controller(
     config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
-) -> tuple[ControllerNetwork, float]:
+) -> tuple[rbf.ControllerNetwork, float]:
     """Return the controller network and its held-out error, the RMS over joints of ψ ξ − q_cmd, rad."""
     plan: ControllerTraining = config.controller
     dimension = controller_dimension(config, spec)
@@ -274,9 +265,9 @@ def _train_controller(
         report(JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales), "controller network")
         reach = scale * spread  # the distance at which a unit has fallen to 1/e
         widths = np.full(plan.hidden, reach if plan.kernel == "gaussian" else np.sqrt(reach))
-        h = hidden_features(samples.xi, centres, widths, plan.kernel)
+        h = rbf.hidden_features(samples.xi, centres, widths, plan.kernel)
         for weights in _controller_weights(plan, samples, wanted, h, held):
-            candidate = ControllerNetwork(
+            candidate = rbf.ControllerNetwork(
                 centres, widths, weights, plan.error_history, plan.position_history, plan.kernel, plan.step
             )
             error = float(np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2)))

@@ -25,51 +25,30 @@ from servobench.plant.contract.signals import BoolArray, Observation
 
 
 class LastFrame(NamedTuple):
-    """The frame at which the last motion ended.
+    """The frame at which the last motion ended."""
 
-    Attributes:
-        time: (...) [s]; NaN before there is a valid feature.
-        joint_position: (..., n) [rad].
-        feature: (..., m).
-        valid: (..., m), which features were last.
-        jacobian: Ĵ, (..., m, n), which predicts the next motion; NaN before.
-    """
-
-    time: FloatArray
-    joint_position: FloatArray
-    feature: FloatArray
-    valid: BoolArray
-    jacobian: FloatArray
+    time: FloatArray  # (...) [s]; NaN before there is a valid feature
+    joint_position: FloatArray  # (..., n) [rad]
+    feature: FloatArray  # (..., m)
+    valid: BoolArray  # (..., m), which features were last
+    jacobian: FloatArray  # Ĵ, (..., m, n), which predicts the next motion; NaN before
 
 
 class Learned(NamedTuple):
-    """The states that change with a motion.
+    """The states that change with a motion."""
 
-    Attributes:
-        estimator: state of the estimator.
-        pair: state of the pair stage; None without one.
-        unexplained: ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion.
-    """
-
-    estimator: Any
-    pair: Any
-    unexplained: FloatArray
+    estimator: Any  # state of the estimator
+    pair: Any  # state of the pair stage; None without one
+    unexplained: FloatArray  # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
 
 
 class EstimationState(NamedTuple):
-    """The state of both stages.
+    """The state of both stages."""
 
-    Attributes:
-        learned: from motions.
-        last: the frame at which the last motion ended.
-        jacobian: Ĵ, (..., m, n), of this period; NaN before.
-        own: the part of it that is the estimator's.
-    """
-
-    learned: Learned
-    last: LastFrame
-    jacobian: FloatArray
-    own: FloatArray
+    learned: Learned  # from motions
+    last: LastFrame  # the frame at which the last motion ended
+    jacobian: FloatArray  # Ĵ, (..., m, n), of this period; NaN before
+    own: FloatArray  # the part of it that is the estimator's
 
 
 @final

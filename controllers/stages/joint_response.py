@@ -34,27 +34,16 @@ MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that 
 
 
 class JointResponse(NamedTuple):
-    """The response g by regularised least squares over all joints, and the quantities derived from it.
+    """The response g by regularised least squares over all joints, and the quantities derived from it."""
 
-    Attributes:
-        A: (..., N, N), rad², the normal matrix.
-        b: (..., N), rad².
-        commands: the commanded joint steps of the last periods, (..., N + w − 1, n), rad, the newest first.
-        response: g, (..., N).
-        left: the part of each of the last N commands that is still to come, (..., N).
-        lead: (...) [periods].
-        window: w, periods.
-        period: s.
-    """
-
-    A: FloatArray
-    b: FloatArray
-    commands: FloatArray
-    response: FloatArray
-    left: FloatArray
-    lead: FloatArray
-    window: int
-    period: float
+    A: FloatArray  # (..., N, N), rad², the normal matrix
+    b: FloatArray  # (..., N), rad²
+    commands: FloatArray  # the commanded joint steps of the last periods, (..., N + w − 1, n), rad, the newest first
+    response: FloatArray  # g, (..., N)
+    left: FloatArray  # the part of each of the last N commands that is still to come, (..., N)
+    lead: FloatArray  # (...) [periods]
+    window: int  # w, periods
+    period: float  # s
 
     @classmethod
     def immediate(cls, length: int, joint_position: FloatArray, period: float, window: int = 1) -> JointResponse:

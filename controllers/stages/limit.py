@@ -39,25 +39,15 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
 
 
 class _Shared(NamedTuple):
-    """A joint step that is being redistributed.
+    """A joint step that is being redistributed."""
 
-    Attributes:
-        joint_step: (..., n), rad, within the limits.
-        left: (...), share of the wanted step that is still to be made.
-        free: (..., n), joints that may still take over.
-        jacobian: Ĵ, (..., m, n), m/rad.
-        wanted: the wanted step of the feature, (..., m), m.
-        down: (..., n), rad, how far a joint may go down in total.
-        up: the same upwards.
-    """
-
-    joint_step: FloatArray
-    left: FloatArray
-    free: BoolArray
-    jacobian: FloatArray
-    wanted: FloatArray
-    down: FloatArray
-    up: FloatArray
+    joint_step: FloatArray  # (..., n), rad, within the limits
+    left: FloatArray  # (...), share of the wanted step that is still to be made
+    free: BoolArray  # (..., n), joints that may still take over
+    jacobian: FloatArray  # Ĵ, (..., m, n), m/rad
+    wanted: FloatArray  # the wanted step of the feature, (..., m), m
+    down: FloatArray  # (..., n), rad, how far a joint may go down in total
+    up: FloatArray  # the same upwards
 
 
 def redistribute(

@@ -27,17 +27,11 @@ OUTLIER_ODDS: Final = 4.6  # [1] −2 ln of the share of outliers, a tenth
 
 
 class NoiseLevel(NamedTuple):
-    """The state of the estimate.
+    """The state of the estimate."""
 
-    Attributes:
-        variance: σ², (...), m².
-        scores: ℓ_j, (..., grid).
-        guess: the first σ², (...), m².
-    """
-
-    variance: FloatArray
-    scores: FloatArray
-    guess: FloatArray
+    variance: FloatArray  # σ², (...), m²
+    scores: FloatArray  # ℓ_j, (..., grid)
+    guess: FloatArray  # the first σ², (...), m²
 
     @classmethod
     def start(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:

@@ -97,43 +97,25 @@ class Candidates:
 
 
 class PairState(NamedTuple):
-    """The state of the stage.
+    """The state of the stage."""
 
-    Attributes:
-        past: [q, Σ x] of the last periods, (..., H, n + m), the newest first.
-        base: J_n, (..., m, n), of the last period.
-        bank: of a filter for each delay, (..., D, 2m+n+1, m+n+1).
-        scores: ℓ_d, (..., D).
-        noise: σ².
-        candidate: index of the delay, (...).
-        nis: ‖ν‖²/s of the last motion per feature, (...).
-        regression: over the paired motions.
-    """
-
-    past: FloatArray
-    base: FloatArray
-    bank: FloatArray
-    scores: FloatArray
-    noise: NoiseLevel
-    candidate: IntArray
-    nis: FloatArray
-    regression: RegressionState
+    past: FloatArray  # [q, Σ x] of the last periods, (..., H, n + m), the newest first
+    base: FloatArray  # J_n, (..., m, n), of the last period
+    bank: FloatArray  # of a filter for each delay, (..., D, 2m+n+1, m+n+1)
+    scores: FloatArray  # ℓ_d, (..., D)
+    noise: NoiseLevel  # σ²
+    candidate: IntArray  # index of the delay, (...)
+    nis: FloatArray  # ‖ν‖²/s of the last motion per feature, (...)
+    regression: RegressionState  # over the paired motions
 
 
 class Paired(NamedTuple):
-    """A motion of the feature and the joint motion that belongs to it.
+    """A motion of the feature and the joint motion that belongs to it."""
 
-    Attributes:
-        joint_position: (..., n), rad, where the joint motion began.
-        joint_step: Δq, (..., n), rad.
-        predicted: x = J_n Δq, (..., m).
-        h: its regressors in the regression.
-    """
-
-    joint_position: FloatArray
-    joint_step: FloatArray
-    predicted: FloatArray
-    h: FloatArray
+    joint_position: FloatArray  # (..., n), rad, where the joint motion began
+    joint_step: FloatArray  # Δq, (..., n), rad
+    predicted: FloatArray  # x = J_n Δq, (..., m)
+    h: FloatArray  # its regressors in the regression
 
 
 class Past(NamedTuple):

@@ -34,15 +34,10 @@ SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given respons
 
 
 class PredictorState(NamedTuple):
-    """The state of the predict stage.
+    """The state of the predict stage."""
 
-    Attributes:
-        response: of the joints.
-        feature: z, (..., m), m.
-    """
-
-    response: JointResponse
-    feature: FloatArray
+    response: JointResponse  # of the joints
+    feature: FloatArray  # z, (..., m), m
 
 
 @final

@@ -60,21 +60,13 @@ ROTATION_DEVIATIONS: Final = np.array([0.1, 0.1, 0.3])  # [1] ς, of an entry of
 
 
 class Innovation(NamedTuple):
-    """The innovation of one motion in each of N filters, (..., N) but for ν.
+    """The innovation of one motion in each of N filters, (..., N) but for ν."""
 
-    Attributes:
-        nu: ν, (..., N, m).
-        square: ‖ν‖².
-        variance: s.
-        capped: s'.
-        frames: the multiple of σ² in s.
-    """
-
-    nu: FloatArray
-    square: FloatArray
-    variance: FloatArray
-    capped: FloatArray
-    frames: FloatArray
+    nu: FloatArray  # ν, (..., N, m)
+    square: FloatArray  # ‖ν‖²
+    variance: FloatArray  # s
+    capped: FloatArray  # s'
+    frames: FloatArray  # the multiple of σ² in s
 
 
 def fresh_bank(W: FloatArray, variances: FloatArray, frame: FloatArray | float) -> FloatArray:
@@ -153,25 +145,15 @@ def of_filter(tree: Tree, index: IntArray) -> Tree:
 
 
 class RegressionState(NamedTuple):
-    """The state of the regression.
+    """The state of the regression."""
 
-    Attributes:
-        bank: of the filters, (..., B, m+K, K).
-        scores: ℓ_b, (..., B).
-        mean: W̄ with e, (..., m, K).
-        share: Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise.
-        rotation: R of the filter with the largest weight of those that have one, (..., m, m).
-        streak: number of successive frames that do not fit but agree with each other, (...).
-        moves: how often the camera seems to have been moved, (...).
-    """
-
-    bank: FloatArray
-    scores: FloatArray
-    mean: FloatArray
-    share: FloatArray
-    rotation: FloatArray
-    streak: IntArray
-    moves: IntArray
+    bank: FloatArray  # of the filters, (..., B, m+K, K)
+    scores: FloatArray  # ℓ_b, (..., B)
+    mean: FloatArray  # W̄ with e, (..., m, K)
+    share: FloatArray  # Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise
+    rotation: FloatArray  # R of the filter with the largest weight of those that have one, (..., m, m)
+    streak: IntArray  # number of successive frames that do not fit but agree with each other, (...)
+    moves: IntArray  # how often the camera seems to have been moved, (...)
 
 
 @final

@@ -25,13 +25,9 @@ _NUMBERS = count()
 
 @dataclass
 class Frame:
-    """The faults of a function that is being recorded.
+    """The faults of a function that is being recorded."""
 
-    Attributes:
-        code: of the worst one, an expression.
-    """
-
-    code: Expression = field(default_factory=lambda: casadi.MX(0.0))
+    code: Expression = field(default_factory=lambda: casadi.MX(0.0))  # of the worst one, an expression
 
 
 _FRAMES: list[Frame] = []

@@ -126,15 +126,10 @@ def _without_memo(value: Any) -> Callable[..., Any] | None:  # noqa: ANN401 - an
 
 @dataclass(frozen=True)
 class Recorded:
-    """A system x(0) = start(u), (x, y) ← step(x, u).
+    """A system x(0) = start(u), (x, y) ← step(x, u)."""
 
-    Attributes:
-        start: CasADi function u -> x, code.
-        step: CasADi function x, u -> x, y, code; a code that is not 0 is that of a fault, as in `branches`.
-    """
-
-    start: Any
-    step: Any
+    start: Any  # CasADi function u -> x, code
+    step: Any  # CasADi function x, u -> x, y, code; a code that is not 0 is that of a fault, as in `branches`
 
     @property
     def states(self) -> int:

@@ -43,8 +43,7 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
     if kind == MCAP:
         check_installed((MCAP,), "the format mcap")
     runs = results.load_runs(folder)
-    if not results.has_steps(folder):
-        raise ConfigurationError(f"{folder} keeps no steps: a sweep does not; use run or compare")
+    results.check_steps(folder)
     try:
         out.mkdir(parents=True)
     except FileExistsError:

@@ -79,14 +79,15 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     """
     manifest, facts = results.read_manifest(folder), describe_folder(folder, runs)
     packages = manifest.get("packages") or {}
-    version, commit = packages.get("servobench") or "unknown", str(manifest.get("git_commit") or "unknown")[:12]
+    version = str(packages.get("servobench") or "unknown").translate(SIGNS)
+    commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
     used = [f"{name} {packages[name]}" for name in MAIN_PACKAGES if packages.get(name)]
     used += [str(engine) for engine in (manifest.get("engines") or {}).values()]
-    robots = ", ".join(str(each["title"]) for each in manifest.get("robots", [])) or "unknown robot"
+    robots = ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
     seeds, count = facts["seeds"].partition(" (")[0], runs["seed"].nunique()
     sentences = [
-        f"All runs were made with servobench {version}~\\cite{{servobench}} "
-        + f"(commit {commit}, Python {manifest.get('python', 'unknown')}, {', '.join(used)})".translate(SIGNS),
+        f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, "
+        + f"Python {manifest.get('python', 'unknown')}, {', '.join(used)})".translate(SIGNS),
         f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
         f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {facts['mismatch']}",
         f"Every controller met the same {count} random robot{'s' * (count > 1)} (seeds {seeds}; {len(runs)} runs)",
@@ -96,7 +97,7 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
         _settings(manifest.get("changed")),
     ]
     text = [sentences[0], *(each.translate(SIGNS) for each in sentences[1:])]
-    year = str(manifest.get("created", ""))[:4]
+    year = str(manifest.get("created", ""))[:4].translate(SIGNS)
     return rf"\paragraph{{Methods}} {'. '.join(text)}." + "\n\n" + BIBTEX % (year, f"{version}, commit {commit}")
 
 

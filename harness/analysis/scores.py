@@ -26,19 +26,12 @@ SPLITS: Final = 200  # random halves of the robots from which the resolution is 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A method's place among others.
+    """A method's place among others."""
 
-    Attributes:
-        rank: 1 for the first; methods that cannot be told apart from the first one of their rank share it.
-        controller: its name.
-        score: interquartile mean with its interval of 95 %.
-        lost: share of lost runs, which the interquartile mean forgives up to a quarter.
-    """
-
-    rank: int
-    controller: str
-    score: Estimate
-    lost: float
+    rank: int  # 1 for the first; methods that cannot be told apart from the first one of their rank share it
+    controller: str  # its name
+    score: Estimate  # interquartile mean with its interval of 95 %
+    lost: float  # share of lost runs, which the interquartile mean forgives up to a quarter
 
 
 def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray:

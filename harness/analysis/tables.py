@@ -35,6 +35,7 @@ from servobench.harness.analysis.comparison import (
     shown_value,
     split_conditions,
     split_tasks,
+    texts_of,
     with_places,
 )
 from servobench.harness.analysis.statistics import (
@@ -163,8 +164,10 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
         return []
     if not pairs:
         raise ConfigurationError(f"--metric {metric} is that by which pairs of controllers are compared; there is one")
-    metric = judged_metric(runs) if metric is None else metric
-    numbers = [str(name) for name in runs.select_dtypes("number").columns]
+    judged = judged_metric(runs)
+    metric = judged if metric is None else metric
+    filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns
+    numbers = {judged, *map(str, filled)} & set(runs) - {"seed"}
     if metric not in numbers:
         raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
@@ -281,7 +284,8 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     varied = {short.heading: (short.column, short.scale) for short in SHORT_NAMES.values()}
     varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
     texts = {
-        name: [shown_value(value, scale, MISSING) for value in runs[column]] for name, (column, scale) in varied.items()
+        name: [shown_value(value, scale, MISSING) for value in texts_of(runs, column)]
+        for name, (column, scale) in varied.items()
     }
     keys = ["plant", "task", "mismatch", *varied, "controller", "outcome"]
     named = with_places(runs).assign(outcome=outcomes(runs), **texts)

@@ -49,7 +49,8 @@ from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.settings import REMARKS, remark
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
 RUN_ID: Final = "run_id"
@@ -217,6 +218,8 @@ def build_block(block: Block, workers: Workers, progress: Progress) -> None:
         match told:
             case [float(share), str(subject)]:
                 progress(share, subject)
+            case ["remark", str(text)]:
+                remark(text)
             case str(refusal):
                 refused.append(refusal)
 
@@ -236,6 +239,8 @@ def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
             build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
         except ConfigurationError as error:
             tell(str(error))
+    for text in REMARKS:
+        tell(["remark", text])
 
 
 def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
@@ -366,10 +371,8 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
     """
     if text is None:
         return None
-    try:
+    with configuration_errors("", EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError):
         array: npt.NDArray[Any] = np.lib.format.read_array(BytesIO(b64decode(text)), allow_pickle=False)
-    except (EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError) as error:
-        raise ValueError(str(error)) from error
     return array
 
 

@@ -7,7 +7,7 @@ when they are needed, so that the memory of this process does not grow with thei
 """
 
 import json
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -43,10 +43,17 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
+NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> another, and its values that leave it idle
+    "aids.latency": ("aids.delay", ("ignored", "identified")),
+    "initial.given": ("initial.source", ("nominal", "probe")),
+    "sensing.noise_offset": ("sensing.noise", ("white", "stable", "uniform")),
+    "sensing.outlier_size": ("sensing.outliers", (0.0,)),
+}
 REST: Final = "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
@@ -97,6 +104,7 @@ class Execution:
     observer: Observer = field(default_factory=Observer)  # receives the progress
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
     debug: bool = False  # raise the error of a run that crashes; the runs go one by one in this process
+    part: tuple[int, int] = (1, 1)  # (3, 40): the third of forty parts of the runs only, all of about one size
 
 
 def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) -> None:
@@ -117,6 +125,8 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     elif not is_unused(folder):
         check_resumable(folder)
     runs = survey(Grid(attrgetter("request"), campaign.cells))
+    if how.part[1] > runs.count:
+        raise ConfigurationError(f"a batch of {runs.count} runs has at most {runs.count} parts, got {how.part[1]}")
     own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
@@ -182,6 +192,7 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     check_settings(campaign.settings, runs.sections)
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
+    _remark_on_idle(campaign.settings, [select(request, sections) for request in runs.examples])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
@@ -198,22 +209,62 @@ def prepare_folder(folder: Path, manifest: dict[str, Any], observer: Observer) -
         ConfigurationError: not a results folder, or one of other runs or settings.
     """
     restored = restore_manifest(folder, manifest)
+    check_same_batch(folder, manifest, observer.note, remedy="name another folder with --out")
+    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
+        observer.note(f"note: {line}")
+
+
+def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str) -> None:
+    """Refuse a folder of another batch than that of a manifest; `note` gets a line for each difference that may matter.
+
+    Raises:
+        ConfigurationError: other runs or settings, or another version of a file of the user's.
+    """
     there = results.read_manifest(folder)
-    if there.get("campaign") != manifest["campaign"]:
+    if there.get("campaign") != manifest.get("campaign"):
         raise ConfigurationError(
-            f"{folder} holds results of other runs or settings: {difference(there, manifest)}; "
-            "name another folder with --out"
+            f"{folder} holds results of other runs or settings: {difference(there, manifest)}; {remedy}"
         )
     if changed := changed_source(there, manifest):
         raise ConfigurationError(
-            f"{folder} was begun with another version of {changed}; name another folder with --out, or bring "
-            "the former one back"
+            f"{folder} was begun with another version of {changed}; {remedy}, or bring the former one back"
         )
     for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
-        if there.get(key) != manifest[key]:
-            observer.note(f"note: {folder} was begun with other {things}; later runs may differ")
-    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
-        observer.note(f"note: {line}")
+        if there.get(key) != manifest.get(key):
+            note(f"note: {folder} was begun with other {things}; later runs may differ")
+
+
+def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> int:
+    """Put the finished runs of a batch that was carried out in parts, each in a folder of its own, into one folder.
+
+    Where runs are missing, the same call without a part carries them out in the new folder.
+
+    Args:
+        folders: of the parts, in any order.
+        out: new folder.
+        note: gets a line for each difference between the folders that may matter.
+
+    Returns:
+        Number of runs.
+
+    Raises:
+        ConfigurationError: a folder without parts, of another batch or with a damaged file, or a run that two have.
+    """
+    manifest, found = results.read_manifest(folders[0]), list[tuple[range, Path]]()
+    for folder in folders:
+        results.check_folder(folder)
+        check_same_batch(folder, manifest, note, remedy="leave it away")
+        if not (parts := results.finished_runs(folder)):
+            raise ConfigurationError(f"{folder} holds no part of a batch but a whole one, with nothing to be merged")
+        found += [(each, folder) for each in parts]
+    found.sort(key=lambda pair: pair[0].start)
+    for (runs, folder), (others, other) in pairwise(found):
+        if others.start < runs.stop:
+            raise ConfigurationError(f"{folder} and {other} have the same runs: leave one away")
+    with locked(out):
+        results.create_folder(out, manifest)
+        results.copy_parts(((folder, runs.start) for runs, folder in found), out)
+        return results.put_together(out, manifest)
 
 
 class _Jobs:
@@ -247,11 +298,12 @@ def _carry_out_missing(
     campaign: Campaign, jobs: _Jobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out the runs whose part is not in the folder; yield each block with its results."""
-    total = len(campaign.cells)
-    done = results.finished_runs(folder)
-    missing = total - sum(map(len, done))
-    how.observer.begin(total, total - missing)
-    gaps = (range(one.stop, next_one.start) for one, next_one in pairwise([range(0), *done, range(total, total)]))
+    begin, end = (len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0]))
+    done = [each for each in results.finished_runs(folder) if begin <= each.start < end]
+    missing = end - begin - sum(map(len, done))
+    how.observer.begin(end - begin, end - begin - missing)
+    ends = [range(begin, begin), *done, range(end, end)]
+    gaps = (range(one.stop, next_one.start) for one, next_one in pairwise(ends))
     blocks = cut(
         jobs.at(chain.from_iterable(gaps)),
         even_size(missing, place.count, how.block),
@@ -289,6 +341,18 @@ def _without_effect(assignment: Assignment, examples: Iterable[RunRequest], step
     if key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
         return "no mismatch moves the camera, as camera_move=90deg does"
     return ""
+
+
+def _remark_on_idle(settings: Settings, runs: Iterable[ResolvedRun]) -> None:
+    """Remark on assignments to settings that count only together with another one."""
+    parts = [(run.request.plant, run.plant) for run in runs] + [
+        (run.request.controller, run.controller) for run in runs
+    ]
+    for section, key, text in settings.assigned:
+        name, idle = NEEDED.get(key, ("", ()))
+        values = [flatten(config).get(name) for part, config in parts if part == section]
+        if values and all(value in idle for value in values):
+            remark(f"--set {text} has no effect while {section}.{name} is {values[0]}")
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

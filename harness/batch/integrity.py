@@ -1,5 +1,6 @@
 """The damage of a results folder, and its repair by `--resume`: only runs of damaged files are carried out again."""
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -68,6 +69,8 @@ def examine(folder: Path) -> Examination:
     findings, manifest = [], dict[str, Any]()
     try:
         manifest = results.read_manifest(folder)
+    except results.OtherSchema:
+        raise
     except ConfigurationError as error:
         unread = error.fault if isinstance(error, DamagedFile) else "cannot be read"
         findings.append(Finding(MANIFEST, unread, f"{AGAIN}; it is written anew if the runs are of that command"))
@@ -105,7 +108,7 @@ def check_resumable(folder: Path) -> None:
         ConfigurationError: names it.
     """
     if not any((folder / name).exists() for name in (MANIFEST, RUNS, SUMS, PARTS)):
-        raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read")
+        results.read_manifest(folder)  # says why it cannot
 
 
 def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
@@ -172,8 +175,10 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
         return ""
     names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
     names += [RUNS] if (folder / RUNS).exists() else []
-    intact = [name for name in names if _fault(folder, name) is None]  # the others are made again in any case
-    owners = {tables.owner(folder, name).partition("@")[0] for name in intact}
+    owners = set[str]()
+    for name in names:
+        with contextlib.suppress(DamagedFile):  # which is made again in any case
+            owners.add(tables.owner(folder, name).partition("@")[0])
     if owners - {manifest["campaign"]} or not owners:
         raise ConfigurationError(
             f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "

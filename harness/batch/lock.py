@@ -103,8 +103,9 @@ def locked(folder: Path) -> Iterator[Lock]:
     lock = Lock(path, descriptor, stale)
     try:
         with contextlib.suppress(OSError):  # a full disk does not keep the lock from being held
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
+            if os.fstat(descriptor).st_nlink == 1:  # otherwise it is also a file elsewhere
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
         yield lock
     finally:
         with contextlib.suppress(OSError):  # the folder may be gone, or read-only by now
@@ -114,7 +115,12 @@ def locked(folder: Path) -> Iterator[Lock]:
 
 
 def current_holder(folder: Path) -> Holder | None:
-    """Return the process that writes a folder, as far as it can be told; None if none does."""
+    """Return the process that writes a folder, as far as it can be told; None if none does.
+
+    Raises:
+        ConfigurationError: a link or pipe is in the folder.
+    """
+    refuse_links(folder)
     holder = Holder.read(folder / LOCK)
     return None if holder is None or holder.gone else holder
 

@@ -13,7 +13,7 @@ from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
@@ -30,9 +30,10 @@ def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
     """Return the row of a run of a results folder; without a name the only one.
 
     Raises:
-        ConfigurationError: not a results folder, no such run, or several without a name.
+        ConfigurationError: not a results folder with steps, no such run, or several without a name.
     """
     runs = results.load_runs(folder)
+    results.check_steps(folder)
     names = runs["run_id"].tolist()
     if run_id is None and len(names) > 1:
         raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
@@ -74,10 +75,8 @@ def logged_in_folder(
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
         del asked["robot"]
-    try:
+    with configuration_errors(f"{folder} has a varied setting that is no value: "):
         varied = varied_in_row(row)
-    except ValueError as error:
-        raise ConfigurationError(f"{folder} has a varied setting that is no value: {error}") from error
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
     request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)

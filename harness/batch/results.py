@@ -14,7 +14,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -137,6 +137,28 @@ def part_names(folder: Path, kind: str) -> list[str]:
     return [name for name in names if is_expected(folder, name)]
 
 
+def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
+    """Copy parts, each of a folder and beginning with a run, and the pictures of their runs into another folder.
+
+    Raises:
+        ConfigurationError: a file of them is damaged.
+        UnwritableFolder: the other folder takes no more files.
+    """
+    files: dict[str, Callable[[Path], object]] = {}
+    for folder, index in parts:
+        names = [part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
+        names = [name for name in names if is_expected(folder, name)]
+        _refuse_damaged(folder, names)
+        if (folder / PICTURES).is_dir():
+            runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
+            names = [name for run in runs if (folder / (name := f"{PICTURES}/{run}.png")).is_file()] + names
+        files |= {name: partial(shutil.copyfile, folder / name) for name in names}
+    with writing(other):
+        if any(name.startswith(PICTURES) for name in files):
+            (other / PICTURES).mkdir(exist_ok=True)
+        write_vouched(other, files)
+
+
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
     return [range(own, own + tables.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]
@@ -249,13 +271,16 @@ def describe_missing(folder: Path) -> str:
 
 
 def missing_line(count: int, wanted: int) -> str:
-    """Return a line for the user that only `count` of the `wanted` runs are finished; an empty text if all are."""
+    """Return a line for the user that other than the `wanted` runs are finished; an empty text if these are."""
+    if 0 < wanted < count:
+        return f"{count} runs are there, and the manifest is of {wanted}: a file of another folder is among them"
     return f"{count} of {wanted} runs are there: --resume carries out the others" if count < wanted else ""
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
     """Yield the table of runs of a finished batch, some thousand rows at a time and those of `columns` it has."""
     _refuse_damaged(folder, [RUNS])
+    refuse_lacking(folder / RUNS, "runs", tables.common_schema(folder, [RUNS]))
     return tables.row_groups(folder, RUNS, columns)
 
 
@@ -271,6 +296,7 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
         ConfigurationError: as for `load_runs`.
     """
     check_folder(folder)
+    check_steps(folder)
     names = _intact(folder, STEPS)
     for name in names:
         refuse_lacking(folder / name, "steps", tables.common_schema(folder, [name]))
@@ -302,7 +328,17 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def has_steps(folder: Path) -> bool:
     """Return whether a results folder has a table of steps."""
-    return (folder / STEPS).is_file() or bool(part_names(folder, STEPS))
+    return is_expected(folder, STEPS) or bool(part_names(folder, STEPS))
+
+
+def check_steps(folder: Path) -> None:
+    """Refuse a folder without a table of steps.
+
+    Raises:
+        ConfigurationError: none was kept.
+    """
+    if not has_steps(folder):
+        raise ConfigurationError(f"{folder} holds no steps: a sweep keeps none; use run or compare")
 
 
 def check_folder(folder: Path) -> None:
@@ -313,6 +349,7 @@ def check_folder(folder: Path) -> None:
     """
     read_manifest(folder)
     if not (folder / RUNS).is_file() and not part_indices(folder):
+        _refuse_damaged(folder, [RUNS] if is_expected(folder, RUNS) else [])
         raise ConfigurationError(f"{folder} holds no finished run")
 
 
@@ -330,7 +367,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         text = (folder / MANIFEST).read_text(encoding="utf-8")
         return decode(folder, MANIFEST, text)
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read") from error
+        why = f"its {MANIFEST} cannot be read" if folder.exists() else "it does not exist"
+        raise ConfigurationError(f"{folder} is not a results folder: {why}") from error
 
 
 def is_expected(folder: Path, name: str) -> bool:
@@ -345,7 +383,8 @@ def file_fault(folder: Path, name: str) -> str | None:
 
 def _intact(folder: Path, kind: str) -> list[str]:
     """Return the names of the table of one kind, or of its parts, all of them undamaged."""
-    names = [kind] if (folder / kind).is_file() else part_names(folder, kind)
+    names = [] if (folder / kind).is_file() else part_names(folder, kind)
+    names = names or [kind] * is_expected(folder, kind)
     _refuse_damaged(folder, names)
     return names
 
@@ -370,12 +409,16 @@ CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s 
 ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and that of its elements
     "created": (str,), "python": (str,), "platform": (str,), "campaign": (str,), "seeds": (str,), "run_count": (int,),
     "plants": (list, str), "controllers": (list, str), "tasks": (list, str), "mismatches": (list, str),
-    "robots": (list, dict), "configuration": (dict, dict), "own_controllers": (dict, dict), "own_plants": (dict, dict),
-    "own_tasks": (dict, dict), "plugins": (dict, dict), "packages": (dict,), "engines": (dict,), "files": (dict, str),
-    "side_by_side": (dict, list),
+    "robots": (list, dict), "configuration": (dict, dict), "changed": (dict,), "own_controllers": (dict, dict),
+    "own_plants": (dict, dict), "own_tasks": (dict, dict), "plugins": (dict, dict), "packages": (dict,),
+    "engines": (dict,), "files": (dict, str), "side_by_side": (dict, list),
 }  # fmt: skip
 WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
 SHOWN: Final = 60  # letters of a wrong value that a message holds
+
+
+class OtherSchema(ConfigurationError):
+    """A results folder is of another version of this package."""
 
 
 def encode(manifest: Mapping[str, Any]) -> str:
@@ -392,7 +435,8 @@ def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
         text: of the file.
 
     Raises:
-        ConfigurationError: not a manifest of this schema.
+        ConfigurationError: not a manifest.
+        OtherSchema: one of another schema.
         DamagedFile: an entry has another type than it should.
     """
     try:
@@ -401,9 +445,9 @@ def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
         raise ConfigurationError(f"{folder} is not a results folder: its {name} cannot be read") from error
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if version != SCHEMA_VERSION:
-        raise ConfigurationError(
+        raise OtherSchema(
             f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
-            f"{CHANGES.get(str(version), '')}"
+            f"{CHANGES.get(str(version), '')}; read it with the servobench that wrote it"
         )
     for key, types in ENTRIES.items():
         if key in manifest and not _has_type(manifest[key], *types):

@@ -104,7 +104,7 @@ def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
         for name in names:
             with opened(folder, name) as part:  # threads and datasets would hold memory that grows with the parts
                 table = part.read(use_threads=False).replace_schema_metadata()
-            waiting = pa.concat_tables([waiting, table], promote_options="permissive")
+                waiting = pa.concat_tables([waiting, table], promote_options="permissive")
             if len(waiting) >= ROW_GROUP:
                 writer.write_table(waiting.replace_schema_metadata(writer.schema.metadata))
                 waiting = schema.empty_table()

@@ -109,6 +109,9 @@ class ControllerChecks:
             if np.median(driver.times) > SLOW:
                 self.steps = STEPS_IF_SLOW
             driver.run(self.steps - STEPS_IF_SLOW)
+        if driver.rig.farthest > 2.0 * driver.rig.spec.joint_upper.max():
+            place = f"{at(driver.controller.step)}: nominal_jacobian is called with {driver.rig.farthest:.3g}"
+            raise CheckFailed(f"{place}; joint positions are in rad")
         self._times, self._printed = driver.times, printed.getvalue()
 
     def limits(self) -> None:

@@ -46,6 +46,7 @@ class Rig(Plant):
 
     Attributes:
         conditions: of the runs.
+        farthest: largest joint position at which the model was asked for its Jacobian [rad].
     """
 
     def __init__(self, n: int, m: int) -> None:
@@ -55,7 +56,7 @@ class Rig(Plant):
             n: number of joints.
             m: number of features.
         """
-        self.conditions = Conditions()
+        self.conditions, self.farthest = Conditions(), 0.0
         rng = np.random.default_rng([n, m, 0])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
@@ -73,6 +74,7 @@ class Rig(Plant):
 
     def model_jacobian(self, q: FloatArray) -> FloatArray:
         """Return the Jacobian of the nominal model, as `jacobian`."""
+        self.farthest = max(self.farthest, float(np.abs(q).max()))
         return MODEL_ERROR * self.jacobian(q)
 
     def knowledge(self, *, truth: bool = False, preview: int = PREVIEW) -> RobotKnowledge:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import keyword
 import re
 import sys
@@ -30,7 +31,7 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
-    name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
+    name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")] = "",
     folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
     aids: Annotated[bool, named_option("--aids", "", "A controller with the aids of the bench's methods.")] = False,
 ) -> None:
@@ -49,6 +50,10 @@ def new(
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
+    if importlib.util.find_spec(module) is not None:
+        raise ConfigurationError(
+            f"a Python package is called {module}, which a file of this name would hide; take another"
+        )
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
@@ -120,17 +125,26 @@ def shadow(
     Nothing is simulated: its commands do not change the log.
     """
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
-    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.config.registry import choose_controller, find_controller
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
 
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
+    if out is not None and out.exists() and out.samefile(log):
+        raise ConfigurationError(f"--out {out} is the log itself; name another file")
     chosen = None if controller is None else choose_controller(controller)
     if log.is_dir():
         resolved, table = logged_in_folder(log, run, chosen, sensing)
+        for word, given, usual in (("robot", robot, "ur5"), ("sensing", sensing, "position")):
+            if given not in (usual, own := getattr(resolved.request, word)):
+                raise ConfigurationError(f"--{word} {given} is not that of the run, {own}; leave it out for a folder")
+    elif run is not None:
+        raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
     elif chosen is None:
         raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
+    elif find_controller(chosen).needs_truth:
+        raise ConfigurationError(f"controller {chosen} is given the true robot, which {log} does not have")
     else:
         resolved, table = logged_in_file(log, chosen, robot, sensing)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):

@@ -92,11 +92,11 @@ def record(
     from servobench.harness.pictures.replay import stretch
 
     film = out if out is not None and out.suffix.removeprefix(".") in (MP4, GIF) else None
+    if film is None and out is not None and out.suffix[1:].isalpha() and not out.is_dir():
+        raise ConfigurationError(f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}")
     if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
         raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
-    wanted = selection.split_names(
-        "kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS, selection.among("kinds", KINDS)
-    )
+    wanted = selection.split_among("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:

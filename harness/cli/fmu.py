@@ -80,6 +80,10 @@ def export(
     settings = overrides.settings()
     if controller is None and settings.sections:
         raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
+    if controller is not None and (exported.mismatch != "none" or exported.seed):
+        raise ConfigurationError("--mismatch and --seed are for an arm; a controller does not know them")
+    if output.suffix != ".fmu":
+        raise ConfigurationError(f"--output must end in .fmu, got {output}")
     with exported.compiling() as platforms:
         request = exported.request(controller or "constant", settings)
         if controller is None:

@@ -112,6 +112,7 @@ def init(
     requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
     settings.check_sections([*known_sections(), *names[0], *names[1], *names[2]])
+    settings.check_running(["run", *names[0], *names[1], *names[2]])
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
     titles = {"run": "common to all plants, controllers and tasks"} | {
         name: f"{kind}: {find(name).summary}"

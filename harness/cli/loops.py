@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import named_option, option
+from servobench.harness.cli.options import option, switch
 from servobench.harness.cli.terminal import console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 
@@ -33,14 +33,9 @@ def analyse(
         option("NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
     ] = "true",
     identify: Annotated[
-        bool,
-        named_option(
-            "--identify", "", "Identify all loops from logged small motions, while estimators go on learning."
-        ),
+        bool, switch("--identify", "Identify all loops from logged small motions, while estimators go on learning.")
     ] = False,
-    simulate: Annotated[
-        bool, named_option("--simulate", "", "Also find the limits of gain and latency by simulation.")
-    ] = False,
+    simulate: Annotated[bool, switch("--simulate", "Also find the limits of gain and latency by simulation.")] = False,
     overrides: options.Overrides,
     out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results") / "analyse",
 ) -> None:

@@ -35,7 +35,7 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
     "Studies": (studies.sweep, analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
-    "Tools": (runs.train, results.collect, results.export, results.verify),
+    "Tools": (runs.train, results.collect, runs.merge, results.export, results.verify),
 }
 
 app = typer.Typer(context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False)

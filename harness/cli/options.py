@@ -78,9 +78,15 @@ def named_option(
     )  # fmt: skip
 
 
+def switch(name: str, words: str, **further: Any) -> Any:  # noqa: ANN401 - as above
+    """Declare a switch; see `named_option`."""
+    return named_option(name, "", words, **further)
+
+
 EXECUTION: Final = "Execution"  # panel of workers, limits and resuming
 option = partial(named_option, "")  # called as its parameter
 execution_option = partial(option, rich_help_panel=EXECUTION)
+execution_switch = partial(switch, rich_help_panel=EXECUTION)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -180,12 +186,9 @@ FolderOption = Annotated[
 RunIdOption = Annotated[
     str | None, named_option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")
 ]
-JsonOption = Annotated[bool, named_option("--json", "", "Print JSON, for other programs.")]
+JsonOption = Annotated[bool, switch("--json", "Print JSON, for other programs.")]
 DebugOption = Annotated[
-    bool,
-    named_option(
-        "--debug", "", "Run in this process, and stop at the first crash with its trace.", rich_help_panel=EXECUTION
-    ),
+    bool, execution_switch("--debug", "Run in this process, and stop at the first crash with its trace.")
 ]
 
 
@@ -206,6 +209,20 @@ class Combinations:
         ),
     ] = "position"
     seeds: SeedsOption = "1"
+    part: Annotated[
+        str, execution_option("K/N", "Carry out part K of N of the runs only; servobench merge puts parts together.")
+    ] = "1/1"
+
+    def chosen_part(self) -> tuple[int, int]:
+        """Return K and N of --part.
+
+        Raises:
+            ConfigurationError: it does not name one of N parts.
+        """
+        words = self.part.split("/")
+        if len(words) == 2 and all(word.isdecimal() for word in words) and 1 <= int(words[0]) <= int(words[1]):
+            return int(words[0]), int(words[1])
+        raise ConfigurationError(f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}")
 
     def batch(self) -> Batch:
         """Return them as the planner takes them, each name looked up.
@@ -246,11 +263,8 @@ class Limited:
     ] = None
     isolate: Annotated[
         bool,
-        named_option(
-            "--isolate/--no-isolate",
-            "",
-            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
-            rich_help_panel=EXECUTION,
+        execution_switch(
+            "--isolate/--no-isolate", "Keep plug-ins and foreign FMUs in processes of their own, with limits."
         ),
     ] = True
 
@@ -281,10 +295,7 @@ class Place(Limited):
 class Running(Place):
     """Execution of runs that can be resumed."""
 
-    resume: Annotated[
-        bool,
-        named_option("--resume", "", "Continue in a folder whose runs were interrupted.", rich_help_panel=EXECUTION),
-    ] = False
+    resume: Annotated[bool, execution_switch("--resume", "Continue in a folder whose runs were interrupted.")] = False
 
     def execution(self) -> Execution:
         """Return it as the driver takes it."""
@@ -298,9 +309,7 @@ class Judging:
     """Treatment of runs that fail."""
 
     debug: DebugOption = False
-    strict: Annotated[
-        bool, named_option("--strict", "", "End with exit code 1 if a run failed.", rich_help_panel=EXECUTION)
-    ] = False
+    strict: Annotated[bool, execution_switch("--strict", "End with exit code 1 if a run failed.")] = False
 
     def execution(self, running: Running) -> Execution:
         """Return the execution of runs; one by one in this process if they are debugged.

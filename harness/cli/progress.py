@@ -8,23 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, Observer, Row
 from servobench.harness.cli.terminal import end_interrupted
+from servobench.plant.contract.files import harmless
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
 
@@ -73,15 +64,15 @@ def telling(console: Console, begin: str) -> Iterator[Callable[[float, str], Non
         yield tell
 
 
-class RateColumn(ProgressColumn):
+class RateColumn(progress.ProgressColumn):
     """Runs a second."""
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: progress.Task) -> Text:
         """Return the text for `task`."""
         return Text("" if task.speed is None else f"{task.speed:.1f} runs/s")
 
 
-class Bars(Progress):
+class Bars(progress.Progress):
     """Work of known size: bars with counts and the time left in a terminal, elsewhere a line now and then.
 
     Args:
@@ -90,18 +81,18 @@ class Bars(Progress):
         shown: false where a debugger may need the terminal.
     """
 
-    def __init__(self, console: Console, *further: ProgressColumn, shown: bool = True) -> None:
-        counts = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-        times = TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    def __init__(self, console: Console, *further: progress.ProgressColumn, shown: bool = True) -> None:
+        counts = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()
+        times = progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn()
         super().__init__(*counts, *further, *times, console=console, disable=not shown)
         self._lines, self._begun = Lines(), 0
 
-    def begin(self, name: str, total: int, done: int = 0, **fields: Any) -> TaskID:  # noqa: ANN401 - those of rich
+    def begin(self, name: str, total: int, done: int = 0, **fields: Any) -> progress.TaskID:  # noqa: ANN401 - those of rich
         """Begin a bar; `fields` are for the further columns."""
         self._begun += done
         return self.add_task(name, total=total, completed=done, **fields)
 
-    def reach(self, bar: TaskID, done: int, text: str, **fields: Any) -> None:  # noqa: ANN401 - those of rich
+    def reach(self, bar: progress.TaskID, done: int, text: str, **fields: Any) -> None:  # noqa: ANN401 - those of rich
         """Move a bar; `text` is the line where there are none."""
         self.update(bar, completed=done, **fields)
         if not self.console.is_terminal:
@@ -152,7 +143,7 @@ class ConsoleObserver(Observer):
 
     def note(self, text: str) -> None:
         """Print a line."""
-        self._console.print(text, soft_wrap=True)
+        self._console.print(harmless(text), soft_wrap=True, markup=False, highlight=False)
 
     def close(self) -> None:
         """Take line and bar away."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import JsonOption, named_option, option
+from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
+MAX_SATURATED: Final = 0.8  # share of the periods
 MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
 
 
@@ -32,9 +33,9 @@ def statistics(
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
-    markdown: Annotated[bool, named_option("--markdown", "", "Print the tables as Markdown.")] = False,
+    markdown: Annotated[bool, switch("--markdown", "Print the tables as Markdown.")] = False,
     latex: Annotated[
-        bool, named_option("--latex", "", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
+        bool, switch("--latex", "Print them for LaTeX (booktabs), with a paragraph on methods and BibTeX.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -87,7 +88,7 @@ def figures(
     controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
     names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
     width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 3.5in, 89mm or 252pt.")] = "7.2in",
-    title: Annotated[bool, named_option("--title/--no-title", "", "Write a title above each figure.")] = True,
+    title: Annotated[bool, switch("--title/--no-title", "Write a title above each figure.")] = True,
     format_: Annotated[
         str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")
     ] = "pdf",
@@ -101,13 +102,15 @@ def figures(
     from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
     from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
 
-    formats = selection.split_names("format", format_, ALL_FORMATS, selection.among("format", ALL_FORMATS))
-    kinds = selection.split_names("kind", kind, tuple(KINDS), selection.among("kind", tuple(KINDS)))
+    formats = selection.split_among("format", format_, ALL_FORMATS)
+    kinds = selection.split_among("kind", kind, tuple(KINDS))
     known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
-    shown = selection.split_names("controllers", controllers, known, selection.among("controllers", known))
+    shown = selection.split_among("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):
         raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
+    if len(set(own)) < len(own):
+        raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
     if "pgf" in formats:
         check_tex()
     if missing := results.describe_missing(folder):
@@ -121,8 +124,11 @@ def figures(
             for path in save_figure(named.figure, target / named.stem, formats, exact_width=True)
         ]
     if not files:
-        kept = "" if results.has_steps(folder) else "; it keeps no steps, as run and compare do"
-        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}{kept}")
+        results.check_steps(folder)
+        needed = (
+            "errors and paths are of moves, tracking is of curves, settling, effort and smoothness are of several runs"
+        )
+        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}: {needed}")
     results.vouch(folder, files)
     say("\n".join(map(str, files)))
 
@@ -205,9 +211,14 @@ def say_aids(folder: Path) -> None:
 
 
 def print_faults(runs: pd.DataFrame) -> None:
-    """Print why runs failed, a line each; of many the first ones."""
+    """Print which controllers command too much, and why runs failed, a line each; of many the first ones."""
     from servobench.harness.run.result import COMPLETED
+    from servobench.plant.contract.settings import remark
 
+    saturation = runs.reindex(columns=["controller", "saturation_fraction"])
+    for name, share in saturation.groupby("controller").median().itertuples():
+        if share > MAX_SATURATED:
+            remark(f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s")
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 

@@ -1,7 +1,8 @@
-"""The commands that carry runs out, `servobench run | compare`, and `train`."""
+"""The commands that carry runs out, `servobench run | compare`, and `merge` and `train`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option, switch
 from servobench.harness.cli.results import judge, make_report, print_faults, say_aids
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
@@ -25,7 +26,8 @@ DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 OutOption = Annotated[
     Path | None, named_option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
 ]
-ReportOption = Annotated[bool, named_option("--report/--no-report", "", "Also make the page report.html.")]
+FiguresOption = Annotated[bool, switch("--figures/--no-figures", "Also draw the figures, as PNG.")]
+ReportOption = Annotated[bool, switch("--report/--no-report", "Also make the page report.html.")]
 
 
 def run(
@@ -55,8 +57,9 @@ def run(
     sensing: options.SensingOption = "position",
     seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,
     overrides: options.Overrides,
-    view: Annotated[bool, named_option("--view", "", "Watch the bullet plant in a window.")] = False,
+    view: Annotated[bool, switch("--view", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
+    with_figures: FiguresOption = True,
     with_report: ReportOption = False,
     limited: options.Limited,
     debug: options.DebugOption = False,
@@ -81,7 +84,7 @@ def run(
     batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
-    _carry_out(campaign, out, how, with_report=with_report, strict=True)
+    _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=True)
 
 
 def _default_plant() -> str:
@@ -100,6 +103,7 @@ def compare(
     running: options.Running,
     overrides: options.Overrides,
     out: OutOption = None,
+    with_figures: FiguresOption = True,
     with_report: ReportOption = True,
     judging: options.Judging,
 ) -> None:
@@ -110,7 +114,24 @@ def compare(
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
-    _carry_out(campaign, out, judging.execution(running), with_report=with_report, strict=judging.strict)
+    how = replace(judging.execution(running), part=combinations.chosen_part())
+    _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=judging.strict)
+
+
+def merge(
+    folders: Annotated[list[Path], typer.Argument(help="Results folders of the parts of a batch, of --part.")],
+    out: Annotated[Path, option("FOLDER", "New folder for all of their runs.")],
+) -> None:
+    """Put the parts of a batch into one folder.
+
+    The parts of compare or sweep with --part. Where runs are missing, the same call with --resume carries them out.
+    """
+    from servobench.harness.batch import campaign, results
+
+    count = campaign.merge(folders, out, say)
+    if missing := results.describe_missing(out):
+        say(missing)
+    say(f"{count} runs in {out / results.RUNS}")
 
 
 def train(
@@ -142,7 +163,9 @@ def train(
     say(f"kept in {cache_folder(NETWORKS)}")
 
 
-def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool, strict: bool) -> None:
+def _carry_out(
+    campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
+) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.cli.progress import watching
@@ -150,16 +173,15 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
-        runs = _show(folder, latest=out is None, with_report=with_report)
+        runs = _show(folder, latest=out is None, with_figures=with_figures, with_report=with_report)
     judge(folder, [runs], strict=strict)
 
 
-def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
+def _show(folder: Path, *, latest: bool, with_figures: bool, with_report: bool) -> pd.DataFrame:
     """Print the tables of a folder whose runs are finished, draw its figures and its report, and return its runs."""
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
-    from servobench.harness.pictures.figures import draw_figures
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
@@ -167,10 +189,7 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
     print_faults(runs)
     if latest:
         point_latest(folder)
-    with console.status("drawing the figures"):
-        figures = draw_figures(folder)
-        results.vouch(folder, figures)
-    say(f"tables and {len(figures)} figures in {folder}")
+    say(f"tables and {_draw(folder)} figures in {folder}" if with_figures else f"tables in {folder}")
     if with_report:
         try:
             make_report(folder)
@@ -178,3 +197,14 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
             say(f"no report: {missing or error}")
     return runs
+
+
+def _draw(folder: Path) -> int:
+    """Draw the figures of a folder and return their number."""
+    from servobench.harness.batch import results
+    from servobench.harness.pictures.figures import draw_figures
+
+    with console.status("drawing the figures"):
+        figures = draw_figures(folder)
+        results.vouch(folder, figures)
+    return len(figures)

@@ -192,8 +192,8 @@ def split_words(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def among(option: str, known: Sequence[str]) -> Callable[[str], str]:
-    """Return a function that returns a word which is one of `known`, and refuses another one with a suggestion."""
+def split_among(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
+    """Split a comma-separated list of words out of `known`, and refuse another one with a suggestion."""
     from servobench.plant.contract.settings import suggest
 
     def find(word: str) -> str:
@@ -201,7 +201,7 @@ def among(option: str, known: Sequence[str]) -> Callable[[str], str]:
             raise ConfigurationError(f"--{option}: unknown {word!r}: {suggest(word, known)}")
         return word
 
-    return find
+    return split_names(option, text, known, find)
 
 
 def split_names(

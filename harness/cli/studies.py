@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, named_option, option
+from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge, say_aids
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import configuration_errors
@@ -52,7 +53,8 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    with watching(console, out, judging.execution(running)) as how:
+    how = replace(judging.execution(running), part=combinations.chosen_part())
+    with watching(console, out, how) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
@@ -153,29 +155,22 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
+    from servobench.harness.studies import reproduction
     from servobench.harness.studies.claims import DIVISIONS
-    from servobench.harness.studies.reproduction import (
-        ANSWERS,
-        FIGURES,
-        differences,
-        elsewhere,
-        read_answers,
-        reproduce,
-    )
 
     names = selection.split("plants", plants)
     divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
-    wanted = None if check is None else read_answers(check)
+    wanted = None if check is None else reproduction.read_answers(check)
     with watching(console, out, running.execution()) as how:
-        answers = reproduce(out, names, seeds, how, divisions)
+        answers = reproduction.reproduce(out, names, seeds, how, divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
-        verdict = answer.verdict + elsewhere(answer, answers)
+        verdict = answer.verdict + reproduction.elsewhere(answer, answers)
         console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
-    say(f"answers in {out / ANSWERS}, figures in {out / FIGURES}")
+    say(f"answers in {out / reproduction.ANSWERS}, figures in {out / reproduction.FIGURES}")
     if wanted is not None:
-        lines = differences(answers, wanted)
+        lines = reproduction.differences(answers, wanted)
         say("\n".join(lines) or f"the same answers as in {check}")
         if lines:
             sys.exit(FAILED)
@@ -202,10 +197,7 @@ def tune(
     ] = 0,
     study_seed: Annotated[int, option("INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
-        bool,
-        named_option(
-            "--check", "", "Change each tuned value in use one by one instead, and name changes that are better."
-        ),
+        bool, switch("--check", "Change each tuned value in use one by one instead, and name changes that are better.")
     ] = False,
     out: Annotated[Path, option("FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"

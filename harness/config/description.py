@@ -19,21 +19,13 @@ SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting as a reader wants it.
+    """A setting as a reader wants it."""
 
-    Attributes:
-        key: its dotted name within the section.
-        value: as it is.
-        unit: of the value, such as `s`; empty where none is told.
-        allowed: the values that may be given, in words; empty where the default shows the type already.
-        meaning: one line; empty where none is told.
-    """
-
-    key: str
-    value: Any
-    unit: str
-    allowed: str
-    meaning: str
+    key: str  # its dotted name within the section
+    value: Any  # as it is
+    unit: str  # of the value, such as `s`; empty where none is told
+    allowed: str  # the values that may be given, in words; empty where the default shows the type already
+    meaning: str  # one line; empty where none is told
 
     @property
     def group(self) -> str:

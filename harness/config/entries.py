@@ -52,17 +52,11 @@ class BenchSettings:
 
 @dataclass(frozen=True, eq=False)
 class Guarded:
-    """A function of a user, whose errors are one line and whose result is of a known kind.
+    """A function of a user, whose errors are one line and whose result is of a known kind."""
 
-    Attributes:
-        make: called with the settings and a `RobotKnowledge` or `PlantSetup`.
-        kind: class of the result; None for any.
-        with_config: whether it takes the settings.
-    """
-
-    make: Callable[..., Any]
-    kind: type[Controller] | type[Plant] | None = None
-    with_config: bool = True
+    make: Callable[..., Any]  # called with the settings and a `RobotKnowledge` or `PlantSetup`
+    kind: type[Controller] | type[Plant] | None = None  # class of the result; None for any
+    with_config: bool = True  # whether it takes the settings
 
     def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - an object of `kind`
         """Return the result.
@@ -380,25 +374,15 @@ def _describe(given: object) -> str:
 
 @dataclass(frozen=True)
 class Own(Generic[Entry]):
-    """A controller or plant that is no part of servobench and no entry point.
+    """A controller or plant that is no part of servobench and no entry point."""
 
-    Attributes:
-        word: "controller" or "plant".
-        entry: which builds it.
-        place: where it stands, for messages.
-        source: its file; None where other processes import its module.
-        file: path of the code; empty for code that was typed into an interpreter.
-        digest: SHA-256 of the code; empty where it cannot be read.
-        given: whether it was given as an object in Python.
-    """
-
-    word: str
-    entry: Entry
-    place: str
-    source: SourceFile | None = None
-    file: str = ""
-    digest: str = ""
-    given: bool = False
+    word: str  # "controller" or "plant"
+    entry: Entry  # which builds it
+    place: str  # where it stands, for messages
+    source: SourceFile | None = None  # its file; None where other processes import its module
+    file: str = ""  # path of the code; empty for code that was typed into an interpreter
+    digest: str = ""  # SHA-256 of the code; empty where it cannot be read
+    given: bool = False  # whether it was given as an object in Python
 
     @property
     def name(self) -> str:

@@ -10,6 +10,7 @@ Without a mapping, variables are looked for under the names that exported contro
 are written, a step of one period is taken, and the outputs are read.
 """
 
+import contextlib
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,16 +22,16 @@ from annotated_types import MinLen
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import File, Names, Positive, Values, nested, settings
+from servobench.plant.contract.settings import File, Names, Positive, Values, nested, remark, settings
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.library import InstanceOptions
-from servobench.plant.fmu.mapping import make_mapping
+from servobench.plant.fmu.mapping import STEP_TOLERANCE, make_mapping
 from servobench.plant.fmu.world import STRUCTURAL, setter, structural_sizes
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -116,10 +117,20 @@ class FmuController(Controller):
             came = total_size(found[role])
             if found[role] and came != size:
                 raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
+        taken: dict[str, str] = {}
         for role in ("joints", "features", "seen", "reference"):
             for variable in found[role]:
                 if variable.causality != "input":
                     raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
+                if (other := taken.setdefault(variable.name, role)) != role:
+                    raise ValueError(
+                        f"{file}: {role} and {other} both name the input {variable.name!r}; each has its own"
+                    )
+        inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
+        if idle := [name for name in inputs if name not in taken]:
+            remark(f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value")
+        if (usual := self._description.usual_step) is not None and abs(usual - self._period) > STEP_TOLERANCE * usual:
+            remark(f"{file} is meant for a period of {usual:g} s, and run.period is {self._period:g} s")
         came = total_size(found["reference"])
         rows, rest = divmod(came, m)
         if rest or rows > 1 + preview:
@@ -202,12 +213,10 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
         mapping = make_mapping(ControllerMapping, path, read_toml("mapping", path))
         how = f"as mapped by {path.name}"
 
+    @configuration_errors("", FmuError)
     def build(config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
         del config
-        try:
-            return FmuController(mapping, knowledge)
-        except FmuError as error:
-            raise ValueError(str(error)) from error
+        return FmuController(mapping, knowledge)
 
     return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, build)
 
@@ -230,8 +239,6 @@ def _conventional(path: Path) -> ControllerMapping:
 
 
 def _has(description: FmuDescription, name: str) -> bool:
-    try:
-        description.find(name, "convention", NUMERIC)
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(description.find(name, "convention", NUMERIC))
+    return False

@@ -216,13 +216,11 @@ def _made_controller(name: str) -> ControllerEntry | None:
     law, plus, estimator = name.partition("+")
     if not plus:
         return None
-    try:
+    with configuration_errors(f"controller {name!r}: "):
         return compose(law, estimator)
-    except ValueError as error:
-        raise ValueError(f"controller {name!r}: {error}") from error
 
 
-PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant)
+PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=(".fmu", ".toml"))
 CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
     CONTROLLER,
     "servobench.controllers",

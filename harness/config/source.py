@@ -33,15 +33,10 @@ _MODULES_OF_USERS: Final[set[str]] = set()  # top-level modules that users named
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A Python file as it was read. It can be pickled: a process that receives it carries out the same text.
+    """A Python file as it was read. It can be pickled: a process that receives it carries out the same text."""
 
-    Attributes:
-        path: of the file, absolute.
-        text: its content.
-    """
-
-    path: Path
-    text: str
+    path: Path  # of the file, absolute
+    text: str  # its content
 
     @classmethod
     def read(cls, given: str) -> Self:

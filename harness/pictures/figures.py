@@ -77,19 +77,12 @@ class NamedFigure(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """The figures that are wanted of a folder, and their appearance.
+    """The figures that are wanted of a folder, and their appearance."""
 
-    Attributes:
-        kinds: some of KINDS.
-        names: controllers that are shown, with the names that they have in the figures; None for all.
-        layout: of the figures; a narrow one shows tasks one by one.
-        title: whether the figures have titles.
-    """
-
-    kinds: Collection[str] = tuple(KINDS)
-    names: Mapping[str, str] | None = None
-    layout: Layout = WIDE
-    title: bool = True
+    kinds: Collection[str] = tuple(KINDS)  # some of KINDS
+    names: Mapping[str, str] | None = None  # controllers that are shown, with their names in the figures; None for all
+    layout: Layout = WIDE  # of the figures; a narrow one shows tasks one by one
+    title: bool = True  # whether the figures have titles
 
 
 def draw_figures(folder: Path) -> list[Path]:

@@ -16,14 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pandas.api.types import is_numeric_dtype
 
-from servobench.harness.analysis.comparison import (
-    CURVE,
-    metric_heading,
-    settled_share,
-    settling_times,
-    shown_unit,
-    texts_of,
-)
+from servobench.harness.analysis import comparison
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.style import (
     LETTER,
@@ -187,23 +180,23 @@ def _short(milliseconds: float) -> str:
 
 def _label(column: str, runs: pd.DataFrame) -> str:
     """Return the label of an axis, which has a unit in any case."""
-    heading = metric_heading(column, runs)
+    heading = comparison.metric_heading(column, runs)
     return heading if heading.endswith("]") else f"{heading} [1]"
 
 
 def _moves(runs: pd.DataFrame) -> pd.Series[bool]:
     """Return which runs are moves; a curve has no settling time."""
-    return texts_of(runs, "task_kind") != CURVE
+    return comparison.texts_of(runs, "task_kind") != comparison.CURVE
 
 
 def _never(runs: pd.DataFrame, column: str) -> pd.Series[bool]:
     """Return which runs have no settling time although they are moves; of other measures none."""
-    return _moves(runs) & settling_times(runs).isna() & (column == SETTLING)
+    return _moves(runs) & comparison.settling_times(runs).isna() & (column == SETTLING)
 
 
 def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str) -> None:
     """Draw a measure of the runs of one task."""
-    values, never = shown_unit(column, runs)[1] * runs[column].astype(float), _never(runs, column)
+    values, never = comparison.shown_unit(column, runs)[1] * runs[column].astype(float), _never(runs, column)
     floor = values.max() / MAX_RANGE
     values = values.where(~((values > 0.0) & (values < floor)), floor)
     if column == SETTLING:
@@ -334,7 +327,7 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
         return None
     figure, panels = panel_grid(len(sweeps), 2.5, layout)
     for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
-        shares = {key: settled_share(own) for key, own in part.groupby(["controller", "size"])}
+        shares = {key: comparison.settled_share(own) for key, own in part.groupby(["controller", "size"])}
         names, sizes = part["controller"].unique(), sorted(part["size"].unique())
         values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
         draw_curves(axes, sizes, values, styles, top=104.0)

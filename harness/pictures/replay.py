@@ -45,29 +45,17 @@ class Trail(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoggedRun:
-    """A logged run with all that its pictures need.
+    """A logged run with all that its pictures need."""
 
-    Attributes:
-        track: its row in the table of runs, and its steps.
-        robot: by its maker's description.
-        model: the true arm and camera.
-        moved: the same after the camera was moved in the middle of the run; None if it was not.
-        moved_from: first period that the moved camera sees; the number of periods if none.
-        config: the rendered plant's settings, for its camera.
-        joint_position: (k, n) [rad], as reported.
-        ball: (k, 3) [m], base frame.
-        reference: (k, 3) [m], base frame.
-    """
-
-    track: Track
-    robot: Robot
-    model: HandEyeModel
-    moved: HandEyeModel | None
-    moved_from: int
-    config: RenderedConfig
-    joint_position: FloatArray
-    ball: FloatArray
-    reference: FloatArray
+    track: Track  # its row in the table of runs, and its steps
+    robot: Robot  # by its maker's description
+    model: HandEyeModel  # the true arm and camera
+    moved: HandEyeModel | None  # the same after the camera was moved in the middle of the run; None if it was not
+    moved_from: int  # first period that the moved camera sees; the number of periods if none
+    config: RenderedConfig  # the rendered plant's settings, for its camera
+    joint_position: FloatArray  # (k, n) [rad], as reported
+    ball: FloatArray  # (k, 3) [m], base frame
+    reference: FloatArray  # (k, 3) [m], base frame
 
 
 def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[str, Any]) -> LoggedRun:

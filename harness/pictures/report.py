@@ -18,16 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.analysis import tables
-from servobench.harness.analysis.comparison import (
-    handy_unit,
-    in_handy_units,
-    metric_heading,
-    outcomes,
-    settling_band,
-    shown_unit,
-    texts_of,
-)
+from servobench.harness.analysis import comparison, tables
 from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
@@ -136,8 +127,8 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         leaders=leaders(runs),
         scope=_scope(runs, facts),
         aids=describe_controllers(folder),
-        band=settling_band(runs),
-        following=settling_band(runs, FOLLOWING_BANDS),
+        band=comparison.settling_band(runs),
+        following=comparison.settling_band(runs, FOLLOWING_BANDS),
         published=PUBLISHED,
         pictures=report_pictures(folder, runs),
         views=views,
@@ -182,16 +173,16 @@ def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     known = runs.reset_index(drop=True)
     if len(known) <= SHOWN_RUNS:
         return known
-    wrong = ~outcomes(known).isin(ACHIEVED)
+    wrong = ~comparison.outcomes(known).isin(ACHIEVED)
     return known.loc[wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]].sort_index()
 
 
 def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the data of the scripts: runs by their number, with the error over time of those whose steps are kept."""
     curves = error_curves(folder, shown)
-    shown = in_handy_units(shown)
+    shown = comparison.in_handy_units(shown)
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
-    scales = {name: shown_unit(name, shown)[1] for name in known}
+    scales = {name: comparison.shown_unit(name, shown)[1] for name in known}
     place = shown.groupby(
         ["controller", *(n for n in ("task", *tables.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
         dropna=False,
@@ -202,14 +193,16 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
             "controller": str(row["controller"]),
             "place": int(place[number]),
             "reason": str(row.get("reason") or ""),
-            "band": rounded(handy_unit(row.get("feature_unit"))[1] * float(row.get("settling_band", float("nan")))),
+            "band": rounded(
+                comparison.handy_unit(row.get("feature_unit"))[1] * float(row.get("settling_band", float("nan")))
+            ),
             "values": [rounded(scales[name] * float(row[name])) for name in known],
         }
         for number, row in zip(shown.index, shown.to_dict("records"), strict=True)
     }
     numbers = {str(row): str(number) for number, row in shown["run_id"].items()}
     return {
-        "measures": [metric_heading(name, shown) for name in known],
+        "measures": [comparison.metric_heading(name, shown) for name in known],
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
         "swatches": {
@@ -248,14 +241,14 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     for first in range(0, len(wanted), STEPS_AT_ONCE) if results.has_steps(folder) else ():
         part = wanted[first : first + STEPS_AT_ONCE]
         steps = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
-        for run_id, feature_unit in zip(part["run_id"], texts_of(part, "feature_unit"), strict=True):
+        for run_id, feature_unit in zip(part["run_id"], comparison.texts_of(part, "feature_unit"), strict=True):
             if run_id in steps:
                 curves[run_id] = _curve(steps[run_id], feature_unit, points)
     return curves
 
 
 def _curve(steps: pd.DataFrame, feature_unit: str | None, points: int) -> Json:
-    unit, factor = handy_unit(feature_unit)
+    unit, factor = comparison.handy_unit(feature_unit)
     bins = np.array_split(factor * steps["error_norm"].to_numpy(dtype=np.float64), min(points, len(steps)))
     error = [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins]
     return {"end": rounded(float(steps["time_s"].iloc[-1])), "unit": unit, "error": error}

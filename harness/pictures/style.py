@@ -5,8 +5,9 @@ import io
 import math
 import re
 import shutil
-from collections.abc import Iterable
-from contextlib import AbstractContextManager
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -192,9 +193,10 @@ def fitted(name: str, letters: int) -> str:
     return "\n".join(line[i : i + letters] for line in lines for i in range(0, len(line), letters))
 
 
-def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
-    """Return the context in which every figure is drawn, with text of a size [pt]; fonts in PDF are embedded."""
-    return mpl.rc_context(
+@contextmanager
+def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
+    """Yield in the context in which every figure is drawn, with text of a size [pt]; fonts in PDF are embedded."""
+    style = mpl.rc_context(
         {
             "font.size": size,
             "axes.titlesize": size,
@@ -208,6 +210,9 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
             "pgf.rcfonts": False,
         }
     )
+    with style, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph ")  # of a name, which the font lacks
+        yield
 
 
 def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1.0) -> tuple[Figure, list[Axes]]:

@@ -18,7 +18,7 @@ from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, s
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 FEATURE = "feature_"
 LONG = 6000  # [rows] of a run that is not drawn row by row
@@ -165,7 +165,9 @@ def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | Non
     """Return the steps of each of these runs that has some, by its identifier; all columns, or those named."""
     try:
         steps = results.load_steps(folder, run_ids, columns)
-    except ConfigurationError:  # none is kept, or each of these runs ended before its first period
+    except ConfigurationError as error:  # none is kept, or each of these runs ended before its first period
+        if type(error) is not ConfigurationError:  # a file is damaged
+            raise
         return {}
     return {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
 
@@ -184,10 +186,8 @@ def values_drawn(row: Mapping[Any, Any]) -> dict[str, Any]:
     Raises:
         ConfigurationError: the row has something else.
     """
-    try:
+    with configuration_errors(f"run {row['run_id']} has mismatch_values that are none: ", TypeError):
         return dict(json.loads(row.get("mismatch_values") or "{}"))
-    except (ValueError, TypeError) as error:
-        raise ConfigurationError(f"run {row['run_id']} has mismatch_values that are none: {error}") from error
 
 
 def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:

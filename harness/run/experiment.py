@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing, sensing_file
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
@@ -44,6 +44,8 @@ from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mis
 from servobench.plant.robot.robot import Robot
 
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
+MAX_PLACE: Final = 20.0  # [m] of a usual target
+MIN_RATE: Final = 10.0  # [mm/rad] usual norm of a Jacobian
 POINTS: Final = 12  # of a curve that are checked
 
 
@@ -76,6 +78,10 @@ def draw(resolved: ResolvedRun) -> Drawn:
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
     true, sample, cameras = draw_robot(request)
+    m = len(true.channel.names)
+    if (made := true.feature(np.stack([robot.workspace.home] * 2)).shape) != (2, m):
+        wanted = f"measure must return {m} features along the last axis"
+        raise ConfigurationError(f"sensing {request.sensing}: {wanted}, got the shape {made} for two postures")
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
     return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
@@ -107,30 +113,32 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         raise ConfigurationError(f"task {name}: {why}")
     with configuration_errors(f"task {name}: "):
         scenario = task.scenario(setting)
+        _check_reference(scenario, len(setting.feature.names))
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
 
 
+def _check_reference(scenario: object, m: int) -> None:
+    """Refuse what a user's task returns in place of a scenario, or of `m` finite features at each instant."""
+    if not isinstance(scenario, Scenario):
+        raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
+    points = np.asarray(scenario.reference.at(np.linspace(0.0, scenario.duration, POINTS)))
+    if points.shape != (POINTS, m) or not np.isfinite(points).all():
+        came = f"shape {points.shape} and {points[:1].tolist()}"
+        raise ConfigurationError(f"its reference must be {m} finite features at each of {POINTS} instants, got {came}")
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A run made ready, or runs that advance together: true robots drawn, plant and controller built.
+    """A run made ready, or runs that advance together: true robots drawn, plant and controller built."""
 
-    Attributes:
-        plant: of runs that advance together a bench with a lane for each.
-        controller: likewise.
-        runs: the true robot and the task of each run.
-        run: the settings that all of them share.
-        networks: that the controller started from, if any.
-        together: whether there are lanes, also for a single run.
-    """
-
-    plant: Plant
-    controller: Controller
-    runs: tuple[Drawn, ...]
-    run: RunSettings
-    networks: Sequence[TrainedNetworks] = ()
-    together: bool = False
+    plant: Plant  # of runs that advance together a bench with a lane for each
+    controller: Controller  # likewise
+    runs: tuple[Drawn, ...]  # the true robot and the task of each run
+    run: RunSettings  # the settings that all of them share
+    networks: Sequence[TrainedNetworks] = ()  # that the controller started from, if any
+    together: bool = False  # whether there are lanes, also for a single run
 
     @property
     def drawn(self) -> Drawn:
@@ -259,6 +267,7 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     try:
         experiment = build(run, progress=progress)
         experiment.plant.close()
+        _check_features(run, experiment)
     except ConfigurationError:
         raise
     except BaseException as error:
@@ -277,6 +286,25 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     if experiment.drawn.true is not None:
         _check_joints(run, experiment.scenario, experiment.plant.spec)
         _check_reach(run, experiment.scenario, experiment.plant.spec)
+
+
+def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
+    """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move."""
+    spec, true, start = experiment.plant.spec, experiment.drawn.true, experiment.scenario.start
+    desired, task, unit = experiment.desired(), f"the reference of the task {run.request.task}", spec.feature_unit
+    if true is None or start is None:
+        if unit == "m" and (size := np.abs(desired).max()) > MAX_PLACE:
+            remark(f"{task} reaches {size:g} m; if places are meant in mm, write the unit, too")
+        return
+    speed = np.linalg.norm(np.diff(desired, axis=0), axis=1).max(initial=0.0) / spec.period
+    J = true.jacobian(start)
+    if speed > (most := float(np.linalg.norm(J, axis=0) @ spec.joint_velocity_limit)):
+        remark(f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start")
+    own = sensing_file(run.request.sensing) is not None
+    if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
+        remark(f"--sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
+    if own and unit == "mm" and np.linalg.norm(J) < MIN_RATE:
+        remark(f"--sensing {run.request.sensing}: features move by {np.linalg.norm(J):.2g} mm/rad; are they in m?")
 
 
 def train_networks(
@@ -406,6 +434,9 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     distances = np.array(_distances(nominal, tuple(map(tuple, points)), *limits))
     beyond = distances - _room(resolved.request.mismatch, robot, nominal.to_base(points))
     worst = int(beyond.argmax())
+    centre = float(np.linalg.norm(nominal.to_base(points) - robot.workspace.shoulder, axis=-1).min())
+    if centre < 0.5 * robot.workspace.reach[0]:
+        remark(f"task {task}: a target {1e3 * centre:.0f} mm from the arm's shoulder is within the arm itself")
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]

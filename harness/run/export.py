@@ -34,6 +34,7 @@ from servobench.harness.run.experiment import Experiment, build, draw, draw_robo
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
+from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
@@ -80,7 +81,10 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     try:
         recorded = record(controller.servo, _start, _step, shapes)
     except NotTraceable as error:
-        raise ConfigurationError(f"controller {entry.name!r} has no exported form: {error}") from error
+        where = f" with --sensing {resolved.request.sensing}, but perhaps with another" * (
+            resolved.request.sensing != DEFAULT_SENSING
+        )
+        raise ConfigurationError(f"controller {entry.name!r} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)
     if not difference <= TOLERANCE:
@@ -168,9 +172,10 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
     """
-    if mechanical := [key for key in request.mismatch.plant_settings if key.startswith("mechanics.")]:
-        name = mechanical[0].removeprefix("mechanics.")
-        raise ConfigurationError(f"an arm is exported without {name}: leave it out, and set the FMU's parameter {name}")
+    moves = ["camera_move"] * (request.mismatch.size("camera_move") > 0.0)
+    for part, _, name in (each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]):
+        remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
+        raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     robot, (true, *_) = find_robot(request.robot), draw_robot(request)
     actuation = default_actuation(robot) if home is None else replace(default_actuation(robot), home=home)
     return product(ExportOptions(fmi, true, actuation, mismatch=words, robot=robot))

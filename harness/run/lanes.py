@@ -58,6 +58,10 @@ class Ends:
         if not len(self.running):
             raise AllEnded
 
+    def left_of(self, lanes: LaneIndex) -> LaneIndex | None:
+        """Return the places of the runs that are still under way among those that were, or None if all are."""
+        return None if len(lanes) == len(self.running) else np.flatnonzero(np.isin(lanes, self.running))
+
     def spread(self, tree: Tree, before: Tree) -> Tree:
         """Return arrays of the runs under way in their places among all runs; the others keep those from before."""
 
@@ -69,22 +73,6 @@ class Ends:
         return tree if len(self.running) == self.count else map_arrays(placed, tree, before)
 
 
-class _Member:
-    """A plant or controller of the runs that were under way when it was last asked."""
-
-    def __init__(self, ends: Ends) -> None:
-        self.ends = ends
-        self._mine = ends.running
-
-    def left(self) -> LaneIndex | None:
-        """Return which of its own lanes are still under way, or None if all are."""
-        if len(self._mine) == len(self.ends.running):
-            return None
-        stay = np.flatnonzero(np.isin(self._mine, self.ends.running))
-        self._mine = self.ends.running
-        return stay
-
-
 @final
 class ManyBenches(Plant):
     """A bench of many lanes, for the loop."""
@@ -92,7 +80,7 @@ class ManyBenches(Plant):
     def __init__(self, bench: Bench, ends: Ends) -> None:
         """Take the bench, which has a lane for each run."""
         self.spec: PlantSpec = bench.spec
-        self._bench, self._ends, self._member, self._k = bench, ends, _Member(ends), 0
+        self._bench, self._ends, self._mine, self._k = bench, ends, ends.running, 0
 
     def reset(self, seed: Any) -> Observation:  # noqa: ANN401 - a seed of each run
         """See `Plant.reset`."""
@@ -132,7 +120,7 @@ class ManyBenches(Plant):
 
     def _leave(self) -> LaneIndex | None:
         """Let runs that ended leave the bench; return which of its lanes stay, or None if all do."""
-        stay = self._member.left()
+        stay, self._mine = self._ends.left_of(self._mine), self._ends.running
         if stay is not None:
             self._bench.keep(stay)
         return stay
@@ -144,7 +132,7 @@ class ManyServos(Controller):
 
     def __init__(self, servo: Servo, ends: Ends) -> None:
         """Take the servo, which has a lane for each run where its parts know the true robot."""
-        self._servo, self._ends, self._member, self._k = servo, ends, _Member(ends), 0
+        self._servo, self._ends, self._mine, self._k = servo, ends, ends.running, 0
 
     def reset(self, observation: Observation, seed: Any) -> None:  # noqa: ANN401 - a seed of each run
         """See `Controller.reset`; no part of a servo draws random numbers."""
@@ -158,10 +146,10 @@ class ManyServos(Controller):
         Raises:
             Exception: a step failed, and repeated with fewer lanes it does not.
         """
-        stay = self._member.left()
+        given, lanes = (observation, reference), self._ends.running
+        stay, self._mine = self._ends.left_of(self._mine), lanes
         if stay is not None:
             self._state = take(self._state, stay)
-        given, lanes = (observation, reference), self._ends.running
         if len(lanes) < self._ends.count:
             given = take(given, lanes)
         try:

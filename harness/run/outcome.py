@@ -19,7 +19,6 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.log import Steps
@@ -117,6 +116,8 @@ def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, Floa
         Distance of the means, (...) [m], and the angle of the rotation between the two, (...) [rad], by the singular
         value decomposition of their correlation (Kabsch).
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
+
     middle, goal = points.mean(axis=-2), wanted.mean(axis=-2)
     correlation = (points - middle[..., None, :]).mT @ (wanted - goal[..., None, :])
     rotation = Rotation.from_matrix(nearest_rotation(correlation).reshape(-1, 3, 3))

@@ -14,7 +14,7 @@ hand about the target at home; ρ is at most 1, and smaller by as much as less o
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, final
+from typing import Final, Literal, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +22,13 @@ import numpy.typing as npt
 from servobench.harness.run.log import column_unit
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.robot import Robot
 
+MAX_BEGIN: Final = 1e6  # [s] after which the first waypoint is one of a clock that counts from 1970 or from a start-up
 TaskKind: TypeAlias = Literal["point_to_point", "curve"]
 """Whether a task's reference is a fixed target or moves."""
 
@@ -75,8 +77,8 @@ class Waypoints(Reference):
             raise ValueError(
                 f"waypoints need times (p,) and points (p, m), got {self.times.shape}, {self.points.shape}"
             )
-        if not (np.diff(self.times) > 0.0).all():
-            raise ValueError("waypoint times must ascend")
+        if not (np.diff(self.times) > 0.0).all() or self.times[0] < 0.0:
+            raise ValueError("waypoint times must ascend, the first one from 0 s on")
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return the interpolated points."""
@@ -128,10 +130,12 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     """
     names = ["time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names)]
     values = numbers_of(f"waypoint file {path}", read_table("waypoint file", path), names)
-    try:
+    if values[0, 0] > MAX_BEGIN:
+        raise ConfigurationError(
+            f"waypoint file {path} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on"
+        )
+    with configuration_errors(f"waypoint file {path}: "):
         return Waypoints(values[:, 0], values[:, 1:])
-    except ValueError as error:
-        raise ValueError(f"waypoint file {path}: {error}") from error
 
 
 class ImageReference(Reference):

@@ -24,23 +24,14 @@ NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a reque
 
 
 class ShortName(NamedTuple):
-    """A short name for a setting that sweeps often vary; it has a column of its own, and a part of the run's name.
+    """A short name for a setting that sweeps often vary; it has a column of its own, and a part of the run's name."""
 
-    Attributes:
-        key: of the setting, `SECTION.KEY`.
-        column: in the table of runs.
-        heading: of this column where it is shown, with the unit.
-        usual: in this column for runs that do not vary the setting.
-        scale: from the value to the number that is shown.
-        unit: of this number.
-    """
-
-    key: str
-    column: str
-    heading: str
-    usual: float | None = None
-    scale: float = 1e3
-    unit: str = "ms"
+    key: str  # of the setting, `SECTION.KEY`
+    column: str  # in the table of runs
+    heading: str  # of this column where it is shown, with the unit
+    usual: float | None = None  # in this column for runs that do not vary the setting
+    scale: float = 1e3  # from the value to the number that is shown
+    unit: str = "ms"  # of this number
 
 
 SHORT_NAMES: Final[Mapping[str, ShortName]] = {
@@ -129,10 +120,8 @@ class RunRequest:
         for short in SHORT_NAMES.values():  # their columns hold numbers
             value = by_role.get(short.key)
             if isinstance(value, str) and (parts := split_quantity(value)):
-                try:
+                with configuration_errors(f"{short.key} = {value!r} must be "):
                     value = in_own_unit(*parts, "s" if short.unit else "1")
-                except ValueError as error:
-                    raise ConfigurationError(f"{short.key} must be {error}, got {value!r}") from error
             if isinstance(value, int | float):
                 by_role[short.key] = float(value)
         return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))

@@ -33,6 +33,11 @@ class Scenario:
     kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
     lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
 
+    def __post_init__(self) -> None:
+        """Check that the evaluated part is one of the run."""
+        if not 0.0 <= self.evaluate_from < self.duration:
+            raise ValueError(f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s")
+
 
 @dataclass(frozen=True)
 class TaskSetting:

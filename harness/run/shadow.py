@@ -30,7 +30,7 @@ MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log w
 MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
 MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
 MAX_LATE: Final = 12  # control periods by which features may be late
-MAX_SHARE_APART: Final = 0.35  # share of the motion by which features may differ without a remark
+MAX_SHARE_APART: Final = {"m": 0.2, "px": 0.35}  # share of the motion by which features may differ without a remark
 
 
 @final
@@ -54,9 +54,11 @@ class LoggedPlant(Plant):
         self.spec, self._k = spec, 0
         names = column_names(spec)
         given = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
-        self._joints, self._features = given
-        valid = table["feature_valid"] if "feature_valid" in table else np.ones(len(table))
-        self._valid = np.asarray(valid, dtype=np.bool_)
+        self.joints, self._features = given
+        valid = numbers_of(LOG, table, ["feature_valid"]) if "feature_valid" in table else np.ones((len(table), 1))
+        self._valid = valid[:, 0] != 0.0
+        if not self._valid.any():
+            raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
         true = names["true_feature"]
         known = set(true) <= set(table)
         self._true = table[true].to_numpy(np.float64) if known else np.full_like(self._features, np.nan)
@@ -70,7 +72,7 @@ class LoggedPlant(Plant):
         Raises:
             ConfigurationError: names the row, and the unit in which the log has to be.
         """
-        spec, q = self.spec, self._joints
+        spec, q = self.spec, self.joints
         beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
         row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
         where = (
@@ -91,10 +93,10 @@ class LoggedPlant(Plant):
 
     def _check_motion(self, model: RobotModel) -> None:
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
-        y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self._joints)))
+        y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self.joints)))
         rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
         apart = min(_apart(y[-k:][self._valid[-k:]], p[:k][self._valid[-k:]], self.spec.feature.unit) for k in rows)
-        if apart > MAX_SHARE_APART:
+        if apart > MAX_SHARE_APART.get(self.spec.feature.unit, MAX_SHARE_APART["px"]):
             remark(
                 f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}: look for other "
                 "units, another order or sign of joints, another arm, or a camera that was moved"
@@ -107,12 +109,12 @@ class LoggedPlant(Plant):
 
     def step(self, command: Command) -> Observation:
         """Return the next row; the command is ignored. See `Plant.step`."""
-        self._k = min(self._k + 1, len(self._joints) - 1)
+        self._k = min(self._k + 1, len(self.joints) - 1)
         return self._row()
 
     def _row(self) -> Observation:
         k = self._k
-        return Observation(k * self.spec.period, self._joints[k], self._features[k], bool(self._valid[k]))
+        return Observation(k * self.spec.period, self.joints[k], self._features[k], bool(self._valid[k]))
 
     def truth(self) -> Truth:
         """Return the true feature of the log, NaN where it has none."""
@@ -162,6 +164,8 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
             remark(
                 f"commands of the log reach {np.abs(commands).max():g} rad/s; if they are in deg/s, write them in rad/s"
             )
+        if np.allclose(commands, plant.joints, atol=MAX_EXCESS):
+            remark("commands of the log are its joint positions, and wanted are velocities")
     return steps
 
 

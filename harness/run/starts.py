@@ -27,7 +27,6 @@ from typing import Annotated, Final, Literal
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Gt, Le
-from scipy.spatial.transform import Rotation
 
 from servobench.harness.run.scenario import Scenario, Task, TaskSetting
 from servobench.plant.cameras.model import SetupModel
@@ -35,6 +34,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings
 from servobench.plant.robot.camera import CAMERA
+from servobench.plant.robot.hand_eye import rotation_matrix
 from servobench.plant.robot.inverse import reach_pose
 from servobench.plant.robot.robot import Robot
 
@@ -51,19 +51,12 @@ IN_VIEW: Final = 0.9  # of the image's half sides in which the target is at the 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Where to draw.
+    """Where to draw."""
 
-    Attributes:
-        lower: (n,) [rad].
-        upper: (n,) [rad].
-        shortest: motion from start to target that the ball of the planned fixed camera would need [m].
-        lowest: height of the ball, or of the camera on the hand, above the table [m].
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    shortest: float
-    lowest: float
+    lower: FloatArray  # (n,) [rad]
+    upper: FloatArray  # (n,) [rad]
+    shortest: float  # motion from start to target that the ball of the planned fixed camera would need [m]
+    lowest: float  # height of the ball, or of the camera on the hand, above the table [m]
 
 
 def draw_in_view(
@@ -160,13 +153,13 @@ def displaced(config: PoseTask, middle: FloatArray) -> FloatArray:
     D, angle = np.eye(4), np.radians(config.angle)
     match config.displacement:
         case "axis_turn":
-            D[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+            D[:3, :3] = rotation_matrix([0.0, 0.0, angle])
         case "retreat":
             D[2, 3] = -config.nearer * middle[2]
         case "camera_turn":
-            D[:3, :3] = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+            D[:3, :3] = rotation_matrix([0.0, angle, 0.0])
         case "plane_turn":
-            D[:3, :3] = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()
+            D[:3, :3] = rotation_matrix([angle, 0.0, 0.0])
             D[:3, 3] = middle - D[:3, :3] @ middle
     return D
 

@@ -26,13 +26,14 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import Count, Duration, NonNegative, Number, Positive, settings
+from servobench.plant.contract.settings import Count, Duration, NonNegative, Number, Positive, remark, settings
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.robot.workspace import Workspace
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
+LONG_RUN: Final = 600.0  # [s]
 RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] of the curves on a UR5
 STRETCHED_START: Final = "singular_start"
 
@@ -227,6 +228,8 @@ class WaypointTask(Task):
         reference = read_waypoints(user_path(self.file), setting.feature)
         duration = float(reference.times[-1]) + self.settle
         check_number("last waypoint's time plus settle", duration, above=0.0)
+        if duration > LONG_RUN:
+            remark(f"the waypoints of {self.file} take {duration:g} s; time_s is in s, not in ms")
         return Scenario(setting.start(self.start), reference, duration, 0.5 * duration)
 
 

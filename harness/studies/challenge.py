@@ -52,21 +52,13 @@ FOLDER: Final = files("servobench.harness.studies") / "challenges"
 
 
 class Measure(NamedTuple):
-    """The measure of a challenge.
+    """The measure of a challenge."""
 
-    Attributes:
-        column: of the table of runs; less is better.
-        floor: below which a difference does not count [unit of the column, m for positions].
-        factor: from the column to the unit in which it is shown.
-        unit: in which it is shown.
-        achieved: the word for a run that is not lost.
-    """
-
-    column: str
-    floor: float
-    factor: float
-    unit: str
-    achieved: str
+    column: str  # of the table of runs; less is better
+    floor: float  # below which a difference does not count [unit of the column, m for positions]
+    factor: float  # from the column to the unit in which it is shown
+    unit: str  # in which it is shown
+    achieved: str  # the word for a run that is not lost
 
 
 MEASURES: Final[Mapping[str, Measure]] = {

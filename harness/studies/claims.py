@@ -38,6 +38,7 @@ from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.faults import ConfigurationError
 
 CLEAR_RATIO: Final = 2.0  # of step times, so large that every machine shows it
 MAX_CIRCLE_ERROR: Final = 0.010  # [m]
@@ -94,25 +95,15 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to one claim on one plant.
+    """The answer to one claim on one plant."""
 
-    Attributes:
-        claim: its number; readings of the paper have a name instead.
-        statement: the claim in a few words.
-        plant: on which the claim was tested.
-        verdict: reproduced, not reproduced, or the cases on which it depends.
-        evidence: one line.
-        measurements: the numbers, for the table and the figure.
-        division: how the methods were equipped.
-    """
-
-    claim: str
-    statement: str
-    plant: str
-    verdict: str
-    evidence: str
-    measurements: tuple[Measurement, ...]
-    division: str = "best equipped"
+    claim: str  # its number; readings of the paper have a name instead
+    statement: str  # the claim in a few words
+    plant: str  # on which the claim was tested
+    verdict: str  # reproduced, not reproduced, or the cases on which it depends
+    evidence: str  # one line
+    measurements: tuple[Measurement, ...]  # the numbers, for the table and the figure
+    division: str = "best equipped"  # how the methods were equipped
 
     @property
     def title(self) -> str:
@@ -158,12 +149,18 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
         tables: tables of runs by name of the study.
         plant: name of the plant.
         division: how the methods were equipped, a key of `DIVISIONS`.
+
+    Raises:
+        ConfigurationError: of a study, no run reached its last period, so that there is nothing to compare.
     """
     plain = {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
     own = {
         name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain})
         for name, table in tables.items()
     }
+    for name, table in own.items():
+        if not (table["status"] == COMPLETED).any():
+            raise ConfigurationError(f"no run of {name} on {plant} reached its last period")
     rules = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)
     answers = [
         *(rule(own, plant) for rule in rules),

@@ -18,7 +18,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
 from servobench.harness.studies.claims import DIVISIONS, MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
 FIGURES: Final = "figures"
@@ -132,12 +132,10 @@ def read_answers(path: Path) -> Answers:
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
-    try:
+    with configuration_errors(f"{path} is not a table of answers: ", OSError, KeyError):
         table = pd.read_csv(path, dtype=str, keep_default_na=False, comment="#")
         rows = table[["claim", "plant", "division", "verdict", "evidence"]].itertuples(index=False)
         return {tuple(key): (verdict, evidence) for *key, verdict, evidence in rows}
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigurationError(f"{path} is not a table of answers: {' '.join(str(error).split())}") from error
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:

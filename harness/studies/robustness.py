@@ -24,17 +24,8 @@ from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings, default_config
+from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.pictures.style import (
-    TEXT,
-    Styles,
-    add_legend,
-    figure_style,
-    label_rows,
-    method_styles,
-    panel_grid,
-    save_figure,
-)
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -254,7 +245,7 @@ def settling_median(runs: pd.DataFrame) -> Estimate:
 
 def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapping[str, float]) -> list[Path]:
     controllers = list(dict.fromkeys(runs["controller"]))
-    styles = method_styles(controllers)
+    styles = style.method_styles(controllers)
     curves: dict[str, Curves] = {}
     for line in KNOWN_LINES.values():
         if line.axis in set(runs["axis"]):
@@ -269,15 +260,15 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
         if line.axis in curves and (line.axis not in flat or len(flat) == len(curves))
     ]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
-    with figure_style(TEXT):
-        figure, panels = panel_grid(len(lines), 1.9, head=1.5)
+    with style.figure_style(style.TEXT):
+        figure, panels = style.panel_grid(len(lines), 1.9, head=1.5)
         for axes, line in zip(panels, lines, strict=True):
             draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, scale.top)
             axes.set_xticks([place.number for place in line.places])
             axes.set_xlabel(line.title)
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
-        label_rows(panels, scale.label)
+        style.label_rows(panels, scale.label)
         arm = runs["robot"].iloc[0] if "robot" in runs else DEFAULT_ROBOT  # folders of 0.1.0 have no such column
         which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
         notes = [f"{robots} {which}, bands are 95 % intervals"]
@@ -286,9 +277,9 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
         if any(np.isinf(e.value) for axis in curves.values() for estimates in axis.values() for e in estimates):
             notes.append("carets at the upper edge: half of the runs or more never settle")
         words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
-        figure.suptitle(f"{title}\n{words}", fontsize=TEXT + 0.5)
-        add_legend(figure, panels)
-    return save_figure(figure, stem)
+        figure.suptitle(f"{title}\n{words}", fontsize=style.TEXT + 0.5)
+        style.add_legend(figure, panels)
+    return style.save_figure(figure, stem)
 
 
 def _is_flat(curves: Curves) -> bool:
@@ -307,7 +298,7 @@ def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
 
 
-def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: Styles) -> None:
+def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: style.Styles) -> None:
     """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
     last = line.places[-1].number
     drawn = {name: 1000.0 * limit for name, limit in limits.items() if name in styles and 1000.0 * limit <= last}

@@ -24,15 +24,7 @@ from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run
 from servobench.harness.config.settings import Settings
-from servobench.harness.pictures.style import (
-    TEXT,
-    WIDTH,
-    add_legend,
-    figure_style,
-    method_styles,
-    plain_logarithms,
-    save_figure,
-)
+from servobench.harness.pictures import style
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.resolution import check_settings, resolve_sections
 from servobench.harness.run.result import COMPLETED
@@ -174,26 +166,26 @@ def draw_suite(runs: pd.DataFrame, stem: Path) -> list[Path]:
     """
     means = runs.pivot_table("score", "controller", "challenge", sort=False)
     means = means.loc[[each.controller for each in ranking(runs)]]
-    shares, styles = profile(runs, DRAWN_FACTORS), method_styles(means.index)
-    with figure_style(TEXT):
+    shares, styles = profile(runs, DRAWN_FACTORS), style.method_styles(means.index)
+    with style.figure_style(style.TEXT):
         heights = (2.2, 0.9 + 0.19 * len(means))
-        figure = Figure(figsize=(WIDTH, sum(heights) + 0.9), layout="constrained")
+        figure = Figure(figsize=(style.WIDTH, sum(heights) + 0.9), layout="constrained")
         top, bottom = figure.subplots(2, 1, height_ratios=heights)
         for name in means.index:
             top.plot(shares.index, shares[name], label=name, **styles[name].line_arguments(len(shares)))
-        plain_logarithms(top, "x")
+        style.plain_logarithms(top, "x")
         top.set(xlabel="times the best method of the run", ylabel="share of runs", ylim=(0.0, 1.02))
         top.set_title(f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}")
         _draw_scores(bottom, means)
-        add_legend(figure, [top])
-    return save_figure(figure, stem)
+        style.add_legend(figure, [top])
+    return style.save_figure(figure, stem)
 
 
 def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:
     """Draw a cell for each method and challenge; dark is good."""
     axes.imshow(means, cmap="Blues", vmin=0.0, vmax=1.3, aspect="auto")  # so that text is readable on every cell
     for (row, column), score in np.ndenumerate(means.to_numpy()):
-        axes.text(column, row, f"{score:.2f}", ha="center", va="center", fontsize=TEXT - 2.0)
+        axes.text(column, row, f"{score:.2f}", ha="center", va="center", fontsize=style.TEXT - 2.0)
     axes.set_xticks(range(means.shape[1]), means.columns, rotation=40.0, ha="right")
     axes.set_yticks(range(len(means)), means.index)
     axes.grid(visible=False)

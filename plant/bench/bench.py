@@ -31,40 +31,24 @@ from servobench.plant.robot.mechanics import RippledJacobian
 
 
 class Frame(NamedTuple):
-    """A frame on its way to the controller.
+    """A frame on its way to the controller."""
 
-    Attributes:
-        due: number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
-        feature: (..., m).
-        valid: (..., m), which features are measured and will arrive.
-    """
-
-    due: int | FloatArray
-    feature: FloatArray
-    valid: BoolArray
+    due: int | FloatArray  # number of the sub-step after which it is delivered; with jitter, (...) and no whole number
+    feature: FloatArray  # (..., m)
+    valid: BoolArray  # (..., m), which features are measured and will arrive
 
 
 @dataclass(frozen=True, eq=False)
 class BenchState:
-    """A saved state of a bench; it can be pickled if that of its world can.
+    """A saved state of a bench; it can be pickled if that of its world can."""
 
-    Attributes:
-        period: number of control periods since the reset.
-        commands: commands under way, oldest first, one a control period.
-        frames: frames under way, oldest first.
-        held: (..., m), the last valid feature.
-        sensor: its random streams, and the outliers and occlusions that last.
-        camera: (..., 4, 4), pose at the start of a camera that turns; None of others.
-        world: the saved state of the world.
-    """
-
-    period: int
-    commands: tuple[FloatArray, ...]
-    frames: tuple[Frame, ...]
-    held: FloatArray
-    sensor: Sensor
-    camera: FloatArray | None
-    world: Any
+    period: int  # number of control periods since the reset
+    commands: tuple[FloatArray, ...]  # commands under way, oldest first, one a control period
+    frames: tuple[Frame, ...]  # frames under way, oldest first
+    held: FloatArray  # (..., m), the last valid feature
+    sensor: Sensor  # its random streams, and the outliers and occlusions that last
+    camera: FloatArray | None  # (..., 4, 4), pose at the start of a camera that turns; None of others
+    world: Any  # the saved state of the world
 
 
 @final

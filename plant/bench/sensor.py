@@ -132,17 +132,11 @@ def begin_probability(share: float, frames: int) -> float:
 
 
 class Spell(NamedTuple):
-    """The state of the spells of each lane.
+    """The state of the spells of each lane."""
 
-    Attributes:
-        left: (...), frames of the present spell that are left after this one.
-        inside: (...), whether the present frame is in a spell.
-        value: (..., *), drawn for the present spell, or for the last one.
-    """
-
-    left: npt.NDArray[np.int_]
-    inside: BoolArray
-    value: FloatArray
+    left: npt.NDArray[np.int_]  # (...), frames of the present spell that are left after this one
+    inside: BoolArray  # (...), whether the present frame is in a spell
+    value: FloatArray  # (..., *), drawn for the present spell, or for the last one
 
     @classmethod
     def none(cls, lead: tuple[int, ...], value: FloatArray) -> Spell:

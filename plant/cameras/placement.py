@@ -23,7 +23,6 @@ from math import atan2, cos, radians, sin
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.cameras.model import Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics
@@ -32,7 +31,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera_file import OwnCamera, turning_point
-from servobench.plant.robot.hand_eye import turn_about
+from servobench.plant.robot.hand_eye import rotation_matrix, turn_about
 from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import camera_pose
@@ -46,21 +45,13 @@ ON_HAND = "mount"  # the axis that a camera on the hand has
 
 @dataclass(frozen=True, eq=False)
 class CameraDraws:
-    """The values drawn for c cameras.
+    """The values drawn for c cameras."""
 
-    Attributes:
-        focal: (c,), factors on the focal lengths.
-        centre: (c, 2), shifts of the principal points [px].
-        distortion: (c,), k of the radial distortion [1].
-        turn: (c, 3), rotation vectors [rad] of the cameras after the first one, whose turn is that of the robot.
-        mount: (c, 3), rotation vectors [rad] about the cameras' own centres.
-    """
-
-    focal: FloatArray
-    centre: FloatArray
-    distortion: FloatArray
-    turn: FloatArray
-    mount: FloatArray
+    focal: FloatArray  # (c,), factors on the focal lengths
+    centre: FloatArray  # (c, 2), shifts of the principal points [px]
+    distortion: FloatArray  # (c,), k of the radial distortion [1]
+    turn: FloatArray  # (c, 3), rotation vectors [rad] of the cameras after the first, whose own is the robot's
+    mount: FloatArray  # (c, 3), rotation vectors [rad] about the cameras' own centres
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists, for JSON."""
@@ -162,7 +153,7 @@ def true_model(
     pivot = nominal.pivot(robot.workspace.centre)
     cameras = np.stack([turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)])
     if mount == "hand":
-        cameras[:, :3, :3] @= Rotation.from_rotvec(draws.mount).as_matrix()
+        cameras[:, :3, :3] @= rotation_matrix(draws.mount)
         cameras[:, :3, 3] += arm.tool - robot.arm.tool
     return _model(setup, mount, robot, arm, cameras, draws)
 
@@ -180,7 +171,7 @@ def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArr
         return np.stack([each.keys.pose.matrix for each in (own, own.second)[: setup.cameras] if each is not None])
     if mount == "fixed":
         above, distance = work.camera_pose()[:3, :3], setup.closeness * work.camera_distance
-        front = Rotation.from_euler("y", SIDE).as_matrix() @ above
+        front = rotation_matrix([0.0, SIDE, 0.0]) @ above
         return np.stack([camera_pose(R, work.centre, distance) for R in (above, front)[: setup.cameras]])
     poses = np.stack([np.eye(4)] * setup.cameras)
     poses[:, :3, 3] = robot.arm.tool

@@ -80,6 +80,10 @@ class SensingSetup:
     least_joints: int = 1
     judges_pose: bool = False
 
+    def __post_init__(self) -> None:
+        """Check names and scale."""
+        self.channel(500.0, 1.0)
+
     @property
     def m(self) -> int:
         """Number of features."""

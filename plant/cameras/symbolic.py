@@ -18,6 +18,7 @@ from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics, project
 from servobench.plant.cameras.setups import POSITION, SensingSetup
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
@@ -30,19 +31,12 @@ SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element acces
 
 
 class ArmGeometry(NamedTuple):
-    """Everything that describes an arm without its ball, as CasADi symbols or constants.
+    """Everything that describes an arm without its ball, as CasADi symbols or constants."""
 
-    Attributes:
-        translation: (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`.
-        rpy: (n+1, 3), rad.
-        joint_offset: o, (n,), rad.
-        gear_ratio: g, (n,).
-    """
-
-    translation: SX
-    rpy: SX
-    joint_offset: SX
-    gear_ratio: SX
+    translation: SX  # (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`
+    rpy: SX  # (n+1, 3), rad
+    joint_offset: SX  # o, (n,), rad
+    gear_ratio: SX  # g, (n,)
 
     @classmethod
     def of(cls, arm: SerialArm) -> Self:
@@ -71,19 +65,12 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
 
 @dataclass(frozen=True, eq=False)
 class SetupGeometry:
-    """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants.
+    """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants."""
 
-    Attributes:
-        arm: the arm.
-        target: p points, each (3,) [m].
-        cameras: of c cameras rotation (3, 3) and position (3,) [m] in the frame that they are mounted on.
-        optics: their intrinsics.
-    """
-
-    arm: ArmGeometry
-    target: list[SX]
-    cameras: list[tuple[SX, SX]]
-    optics: Optics
+    arm: ArmGeometry  # the arm
+    target: list[SX]  # p points, each (3,) [m]
+    cameras: list[tuple[SX, SX]]  # of c cameras rotation (3, 3) and position (3,) [m] in the frame of their mount
+    optics: Optics  # their intrinsics
 
     @classmethod
     def of(cls, arm: SerialArm, target: FloatArray, cameras: FloatArray, optics: Optics) -> Self:
@@ -137,10 +124,8 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     Raises:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
-    try:
+    with configuration_errors(f"sensing {setup.name} has no symbolic twin: ", TypeError, AttributeError, RuntimeError):
         made: Any = setup.measure(points, optics)
-    except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"sensing {setup.name} has no symbolic twin: {error}") from error
     return casadi.vertcat(*made[0].tolist())
 
 

@@ -78,12 +78,13 @@ class ConfigurationError(ValueError):
 
 
 @contextmanager
-def configuration_errors(place: str = "", further: type[Exception] = ValueError) -> Iterator[None]:
-    """Raise a ValueError, or an error of a further type, as a `ConfigurationError` with `place` before its message.
+def configuration_errors(place: str = "", *further: type[Exception]) -> Iterator[None]:
+    """Raise a ValueError, or an error of further types, as a `ConfigurationError` with `place` before its message.
 
     Around statements, `with configuration_errors():`, or around a whole function as its decorator.
     """
+    kinds: tuple[type[Exception], ...] = (ValueError, *further)
     try:
         yield
-    except (ValueError, further) as error:
+    except kinds as error:
         raise ConfigurationError(f"{place}{error}") from error

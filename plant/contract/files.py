@@ -1,5 +1,7 @@
 """Atomic writing of files, and reading of a user's TOML and CSV with errors of one line."""
 
+from __future__ import annotations
+
 import io
 import os
 import re
@@ -7,12 +9,12 @@ import threading
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
-from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError
+if TYPE_CHECKING:
+    from servobench.plant.contract.checks import FloatArray
 
 FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -62,10 +64,8 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
         ConfigurationError: it cannot be read, or is not valid TOML.
     """
     text = read_text(kind, path)
-    try:
+    with configuration_errors(f"{kind} {path} is not valid TOML: ", RecursionError):
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
-        raise ConfigurationError(f"{kind} {path} is not valid TOML: {error}") from error
 
 
 def read_text(kind: str, path: Path) -> str:
@@ -88,10 +88,8 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
         raise ConfigurationError(
             f"{kind} {path} has {marks[0]!r} between its columns; write commas, and numbers as 0.5"
         )
-    try:
+    with configuration_errors(f"{kind} {path} is no table: ", OSError):
         table = pd.read_parquet(path) if text is None else pd.read_csv(io.StringIO(text), skipinitialspace=True)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"{kind} {path} is no table: {error}") from error
     if text is not None and type(table.index) is not pd.RangeIndex:  # the first cells were taken for names of rows
         raise ConfigurationError(f"{kind} {path} has rows of more cells than its header; write numbers as 0.5")
     return table.rename(columns=str.strip)
@@ -103,6 +101,7 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     Raises:
         ConfigurationError: one of them is missing or has something else than finite numbers, or there are no rows.
     """
+    import numpy as np  # noqa: PLC0415 - as above
     import pandas as pd  # noqa: PLC0415 - as above
 
     lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty

@@ -129,19 +129,12 @@ class SensingConfig:
 
 
 class Extents(NamedTuple):
-    """Lengths among the settings of a sensor, in metres of a ball that moves across the planned camera.
+    """Lengths among the settings of a sensor, in metres of a ball that moves across the planned camera."""
 
-    Attributes:
-        feature_noise: σ.
-        noise_offset: μ.
-        quantum: to which features are rounded.
-        outlier_size: distance of an outlier.
-    """
-
-    feature_noise: float
-    noise_offset: float
-    quantum: float
-    outlier_size: float
+    feature_noise: float  # σ
+    noise_offset: float  # μ
+    quantum: float  # to which features are rounded
+    outlier_size: float  # distance of an outlier
 
 
 def without_disturbance(sensing: SensingConfig) -> SensingConfig:

@@ -53,9 +53,10 @@ from servobench.plant.contract.units import EXTENT, alternatives, in_own_unit, i
 
 @plain_dataclass(frozen=True)
 class Usual:
-    """The largest usual size of a number, in its annotation; one beyond it is used, with a remark to the user."""
+    """The usual sizes of a number, in its annotation; one beyond them is used, with a remark to the user."""
 
     size: float
+    least: float = 0.0
 
 
 Number: TypeAlias = Annotated[float, AllowInfNan(False)]
@@ -72,7 +73,7 @@ Deviation: TypeAlias = Annotated[Positive, Usual(0.1)]
 """A standard deviation of a feature in natural units [m]."""
 Duration: TypeAlias = Annotated[Positive, Usual(3600.0)]
 """Length of a run or a part of it [s]."""
-JointSpeed: TypeAlias = Annotated[Positive, Usual(20.0)]
+JointSpeed: TypeAlias = Annotated[Positive, Usual(20.0, 0.01)]
 """The speed of a joint [rad/s]."""
 Share: TypeAlias = Annotated[float, Ge(0.0), Le(1.0)]
 """From 0 to 1, both included."""
@@ -130,6 +131,7 @@ File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if i
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
+REMARKS: Final[list[str]] = []  # of this worker process
 MAX_LISTED = 40  # number of names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above", operator.gt),
@@ -253,15 +255,15 @@ def with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
 
 
 class Check(NamedTuple):
-    """How a value is checked: its type with bounds, and the largest usual size of its numbers; None for any."""
+    """How a value is checked: its type with bounds, and the usual sizes of its numbers."""
 
     type: TypeAdapter[Any]
-    usual: float | None
+    usual: Usual
 
     @classmethod
     def of(cls, hint: Any) -> Self:  # noqa: ANN401 - any annotation
         """Return the check of an annotation, which may have a `Usual`."""
-        return cls(TypeAdapter(hint, config=STRICT), _usual(hint))
+        return cls(TypeAdapter(hint, config=STRICT), _usual(hint) or Usual(math.inf))
 
 
 @cache
@@ -322,19 +324,21 @@ def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) 
         value = check.type.validate_python(_in_own_unit(name, written, unit))
     except ValidationError as error:
         raise ValueError(describe(error, name, written, unit())) from None
-    most = check.usual
-    unusual = [] if most is None else [each for each in _numbers_in(value) if abs(each) > most]
-    if unusual and most is not None:
-        meant = likely_meant(unusual[0], unit(), lambda other: abs(other) <= most)
-        remark(f"{name} is {unusual[0]:g}, and usually at most {f'{most:g} {unit()}'.removesuffix(' 1')}{meant}")
+    least, most = check.usual.least, check.usual.size
+    for number in [each for each in _numbers_in(value) if abs(each) > most or 0.0 < abs(each) < least][:1]:
+        meant = likely_meant(number, unit(), lambda other: least <= abs(other) <= most)
+        bound = f"at most {most:g}" if abs(number) > most else f"at least {least:g}"
+        remark(f"{name} is {number:g}, and usually {f'{bound} {unit()}'.removesuffix(' 1')}{meant}")
     return value
 
 
 @cache
 def remark(text: str) -> None:
-    """Print a remark for the user on standard error, once; worker processes leave it to the one that started them."""
+    """Print a remark for the user on standard error, once; a worker process keeps it for the one that started it."""
     if parent_process() is None:
         logging.getLogger("servobench").warning("servobench: note: %s", text)
+    else:
+        REMARKS.append(text)
 
 
 def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
@@ -351,10 +355,10 @@ def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
     return int(number) if number.is_integer() else number
 
 
-def _usual(hint: Any) -> float | None:  # noqa: ANN401 - any annotation
-    """Return the largest usual size in an annotation, or in that of its items."""
-    found = (each.size if isinstance(each, Usual) else _usual(each) for each in get_args(hint))
-    return next((size for size in found if size is not None), None)
+def _usual(hint: Any) -> Usual | None:  # noqa: ANN401 - any annotation
+    """Return the usual sizes in an annotation, or in that of its items."""
+    found = (each if isinstance(each, Usual) else _usual(each) for each in get_args(hint))
+    return next(filter(None, found), None)
 
 
 def _numbers_in(value: object) -> Iterator[float]:

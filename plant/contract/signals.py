@@ -48,6 +48,8 @@ class Channel:
                 raise ValueError(f"{name} must hold {len(self.names)} numbers, got {bound.tolist()}")
             bound.flags.writeable = False
             object.__setattr__(self, name, bound)
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(f"each joint and feature needs a name of its own, got {', '.join(self.names)}")
         if not (self.lower < self.upper).all():
             raise ValueError(f"lower must be below upper for every one of {', '.join(self.names)}")
 

@@ -35,6 +35,7 @@ class Variable:
         causality: parameter, structuralParameter, input, output, local or independent.
         type: such as Real, Float32, Int64, Boolean or String.
         dimensions: sizes of its axes: numbers, or names of structural parameters with their start values.
+        unit: empty where none is told.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Variable:
     causality: str
     type: str = "Real"
     dimensions: tuple[tuple[str, int], ...] = ()
+    unit: str = ""
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
@@ -256,7 +258,7 @@ def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's v
     size = prod(each for _, each in axes)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
-    return Variable(name, reference, size, variable.causality or "local", variable.type, axes)
+    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, variable.unit or "")
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above

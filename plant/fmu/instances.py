@@ -28,25 +28,15 @@ LAST_SUCCESSFUL_TIME = 2
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The instance of a run and the calls of the inner loop, which return a status.
+    """The instance of a run and the calls of the inner loop, which return a status."""
 
-    Attributes:
-        instance: of the FMU.
-        row: its row in the buffers of all ports.
-        write: writes the command.
-        step: takes one step.
-        read: reads joints and feature.
-        read_truth: reads the true feature and, where it is mapped, the Jacobian.
-        states: saved states that are handles, freed with the instance.
-    """
-
-    instance: Instance
-    row: int
-    write: RawCall
-    step: RawCall
-    read: RawCall
-    read_truth: RawCall
-    states: list[ctypes.c_void_p] = field(default_factory=list)
+    instance: Instance  # of the FMU
+    row: int  # its row in the buffers of all ports
+    write: RawCall  # writes the command
+    step: RawCall  # takes one step
+    read: RawCall  # reads joints and feature
+    read_truth: RawCall  # reads the true feature and, where it is mapped, the Jacobian
+    states: list[ctypes.c_void_p] = field(default_factory=list)  # handles of saved states, freed with the instance
 
     def resting(self) -> Self:
         """Return the lane with calls that do nothing, for an instance that has failed."""

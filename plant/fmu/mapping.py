@@ -19,8 +19,20 @@ from annotated_types import MinLen
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
+from servobench.plant.contract.settings import (
+    File,
+    Names,
+    Numbers,
+    Positive,
+    Usual,
+    Values,
+    nested,
+    override,
+    remark,
+    settings,
+)
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.description import FmuDescription, total_size
 
 Roles = TypeVar("Roles")
@@ -105,7 +117,7 @@ class FmuMapping:
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
     nominal: Mapping[str, Numbers] | None = None
     """Nominal values of parameters, for controllers; needs directional derivatives. None: there is no nominal model."""
-    period: Positive | None = None
+    period: Annotated[Positive, Usual(1.0)] | None = None
     """[s] the FMU's step; None for the control period."""
     tolerance: Positive | None = None
     """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for the solver's own."""
@@ -171,7 +183,15 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     for variable in inputs:
         if variable.causality != "input":
             raise ValueError(f"inputs names {variable.name!r}, which is of causality {variable.causality}")
+    given = mapping.names.feature_unit
+    for variable in features:
+        if variable.unit != given and {variable.unit, given} <= UNITS["m"].keys():
+            raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {given}")
     n, m = total_size(inputs), total_size(features)
+    if mapping.features == mapping.joints:
+        remark(
+            f"features of the mapping are its joints, {', '.join(mapping.joints)}; a camera measures other quantities"
+        )
     truth = mapping.truth
     for name, names, size in (
         ("joints", mapping.joints, n),

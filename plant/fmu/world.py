@@ -18,7 +18,7 @@ import numpy.typing as npt
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup, TrueModel, World
 from servobench.plant.contract.checks import FloatArray, as_array, is_finite, whole_steps
-from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Delay, Names, nested, settings
@@ -402,11 +402,9 @@ def build_fmu(
     Raises:
         ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.
     """
-    try:
-        start = mapping.start if setup.start is None else setup.start
+    start = mapping.start if setup.start is None else setup.start
+    with configuration_errors("", FmuError):
         return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag, model), setup, command_delay, sensing)
-    except FmuError as error:
-        raise ValueError(str(error)) from error
 
 
 def fmu_entry(path: Path) -> PlantEntry:
@@ -415,6 +413,8 @@ def fmu_entry(path: Path) -> PlantEntry:
     Raises:
         ValueError: the mapping cannot be used.
     """
+    if path.suffix == ".fmu":
+        raise ValueError(f"plant {path} needs a mapping, a TOML that names file, inputs and features")
     mapping = read_mapping(path)
 
     def build(config: FmuConfig, setup: PlantSetup) -> Bench:

@@ -49,32 +49,20 @@ MARGIN = COLOUR_MARGIN + 2  # [px] and two for the shift of an edge by rounding 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The largest red patch in an image.
+    """The largest red patch in an image."""
 
-    Attributes:
-        rows: (k,), px.
-        columns: (k,), px.
-    """
-
-    rows: IntArray
-    columns: IntArray
+    rows: IntArray  # (k,), px
+    columns: IntArray  # (k,), px
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A ball as a sphere of known radius fitted to depths.
+    """A ball as a sphere of known radius fitted to depths."""
 
-    Attributes:
-        centre: (3,), m, camera frame.
-        residual: m, RMS of the depths that took part.
-        used: number of those depths.
-        uncertainty: m, standard error of the centre by the residual, all axes together.
-    """
-
-    centre: FloatArray
-    residual: float
-    used: int
-    uncertainty: float
+    centre: FloatArray  # (3,), m, camera frame
+    residual: float  # m, RMS of the depths that took part
+    used: int  # number of those depths
+    uncertainty: float  # m, standard error of the centre by the residual, all axes together
 
 
 def find_patch(rgb: ByteArray) -> Patch | None:
@@ -284,19 +272,12 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class Window(NamedTuple):
-    """Rows and columns of an image, counted from the upper left corner, both ends of which are whole pixels.
+    """Rows and columns of an image, counted from the upper left corner, both ends of which are whole pixels."""
 
-    Attributes:
-        top: first row.
-        left: first column.
-        bottom: row after the last one.
-        right: column after the last one.
-    """
-
-    top: int
-    left: int
-    bottom: int
-    right: int
+    top: int  # first row
+    left: int  # first column
+    bottom: int  # row after the last one
+    right: int  # column after the last one
 
     def cut(self, image: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
         """Return the part of an image (h, w, ...) in this window, without a copy."""

@@ -93,35 +93,21 @@ def drives_for(robot: Robot) -> DriveConfig:
 
 
 class DriveState(NamedTuple):
-    """The joints and their loops; arrays (n,) never change.
+    """The joints and their loops; arrays (n,) never change."""
 
-    Attributes:
-        angle: θ [rad].
-        speed: ω [rad/s].
-        reference: r [rad].
-        reference_speed: c [rad/s].
-        integral: z [Nm].
-    """
-
-    angle: FloatArray
-    speed: FloatArray
-    reference: FloatArray
-    reference_speed: FloatArray
-    integral: FloatArray
+    angle: FloatArray  # θ [rad]
+    speed: FloatArray  # ω [rad/s]
+    reference: FloatArray  # r [rad]
+    reference_speed: FloatArray  # c [rad/s]
+    integral: FloatArray  # z [Nm]
 
 
 class RigidBody(NamedTuple):
-    """Inertia and torques of the links and the load in one state, as the drives have to overcome them.
+    """Inertia and torques of the links and the load in one state, as the drives have to overcome them."""
 
-    Attributes:
-        inertia: M, (n, n) [kg m²].
-        bias: b, (n,) [Nm].
-        assumed_gravity: ĝ, (n,) [Nm].
-    """
-
-    inertia: FloatArray
-    bias: FloatArray
-    assumed_gravity: FloatArray
+    inertia: FloatArray  # M, (n, n) [kg m²]
+    bias: FloatArray  # b, (n,) [Nm]
+    assumed_gravity: FloatArray  # ĝ, (n,) [Nm]
 
 
 class InPlace:

@@ -59,37 +59,22 @@ class Scene(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """The parts that a simulation is built from.
+    """The parts that a simulation is built from."""
 
-    Attributes:
-        arm: the true kinematics.
-        robot: by its maker's description, for masses and shapes.
-        boxes: obstacles other than table and floor.
-        drives: loops, torque limits, friction and load of the joints.
-        lag: [s] by which the drives smooth commanded velocities, 0 for none.
-        start: (n,) [rad], joint angles at which the loops are tuned.
-        stops: (n,) and (n,) [rad], lower and upper stop of the joint angles.
-    """
-
-    arm: SerialArm
-    robot: Robot
-    boxes: tuple[Box, ...]
-    drives: DriveConfig
-    lag: float
-    start: FloatArray
-    stops: tuple[FloatArray, FloatArray]
+    arm: SerialArm  # the true kinematics
+    robot: Robot  # by its maker's description, for masses and shapes
+    boxes: tuple[Box, ...]  # obstacles other than table and floor
+    drives: DriveConfig  # loops, torque limits, friction and load of the joints
+    lag: float  # [s] by which the drives smooth commanded velocities, 0 for none
+    start: FloatArray  # (n,) [rad], joint angles at which the loops are tuned
+    stops: tuple[FloatArray, FloatArray]  # (n,) and (n,) [rad], lower and upper stop of the joint angles
 
 
 class Overlap(NamedTuple):
-    """Two bodies that overlap by `MIN_OVERLAP` or more.
+    """Two bodies that overlap by `MIN_OVERLAP` or more."""
 
-    Attributes:
-        link: number of a link, counted from the base, which is 0; flange, tool and ball belong to the last one.
-        other: number of another link, or the name of a box in the room.
-    """
-
-    link: int
-    other: int | str
+    link: int  # number of a link, counted from the base, which is 0; flange, tool and ball belong to the last one
+    other: int | str  # number of another link, or the name of a box in the room
 
 
 class Simulation(ABC):

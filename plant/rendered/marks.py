@@ -29,15 +29,10 @@ RED: Final[Colour] = (0.90, 0.06, 0.05, 1.0)  # paint of the ball
 
 
 class MarkColour(NamedTuple):
-    """The colour of a mark.
+    """The colour of a mark."""
 
-    Attributes:
-        paint: red, green, blue and opacity.
-        hues: in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap.
-    """
-
-    paint: Colour
-    hues: HueRange
+    paint: Colour  # red, green, blue and opacity
+    hues: HueRange  # in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap
 
 
 MARK_COLOURS: Final = (
@@ -53,17 +48,11 @@ ELLIPSE = 2.0  # standard deviations of a filled ellipse from its middle to its 
 
 
 class Mark(NamedTuple):
-    """The pixels of a mark and their neighbours.
+    """The pixels of a mark and their neighbours."""
 
-    Attributes:
-        rows: (k,) [px].
-        columns: (k,) [px].
-        shares: (k,), of each of them that the mark has.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    shares: FloatArray
+    rows: IntArray  # (k,) [px]
+    columns: IntArray  # (k,) [px]
+    shares: FloatArray  # (k,), of each of them that the mark has
 
 
 def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | None]:

@@ -245,15 +245,10 @@ def _aim(gl_camera: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # no
 
 
 class MujocoState(NamedTuple):
-    """The joints, their loops, and MuJoCo's own state between steps; arrays never change.
+    """The joints, their loops, and MuJoCo's own state between steps; arrays never change."""
 
-    Attributes:
-        loops: angles and speeds of the joints with their loops.
-        acceleration: (n,) [rad/s²], from which the next solution of the constraints starts.
-    """
-
-    loops: DriveState
-    acceleration: FloatArray
+    loops: DriveState  # angles and speeds of the joints with their loops
+    acceleration: FloatArray  # (n,) [rad/s²], from which the next solution of the constraints starts
 
     @property
     def angle(self) -> FloatArray:

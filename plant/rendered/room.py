@@ -13,23 +13,8 @@ import numpy as np
 from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.setups import HALF
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered import urdf
 from servobench.plant.rendered.marks import MARK_COLOURS, RED
-from servobench.plant.rendered.urdf import (
-    BALL_LINK,
-    BALL_MESH,
-    BASE_PART,
-    DARK_GREY,
-    Box,
-    add_joint,
-    add_link,
-    arm_tree,
-    bench_files,
-    boxes_urdf,
-    draw_cylinder,
-    draw_mesh,
-    sphere_obj,
-    text,
-)
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
@@ -85,21 +70,13 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """An arm and the bodies around it; the base frame is the world frame.
+    """An arm and the bodies around it; the base frame is the world frame."""
 
-    Attributes:
-        arm: the true kinematics.
-        scenery: whether the table and the floor are there.
-        robot: by its maker's description, for the visual shapes.
-        boxes: obstacles.
-        rig: target and cameras of a sensing set-up; None for the ball on the flange.
-    """
-
-    arm: SerialArm
-    scenery: bool
-    robot: Robot
-    boxes: tuple[Box, ...] = ()
-    rig: Rig | None = None
+    arm: SerialArm  # the true kinematics
+    scenery: bool  # whether the table and the floor are there
+    robot: Robot  # by its maker's description, for the visual shapes
+    boxes: tuple[urdf.Box, ...] = ()  # obstacles
+    rig: Rig | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
 
     def files(self) -> dict[str, str]:
         """Return the files, text by name: a URDF for each body, that of the arm first, and the meshes they name.
@@ -107,11 +84,11 @@ class Room:
         Raises:
             ValueError: the arm has another number of joints than the robot.
         """
-        files = {**arm_files(self.arm, self.robot, self.rig), BALL_MESH: sphere_obj()}
+        files = {**arm_files(self.arm, self.robot, self.rig), urdf.BALL_MESH: urdf.sphere_obj()}
         if self.scenery:
-            files |= bench_files(self.robot.workspace.scale)
+            files |= urdf.bench_files(self.robot.workspace.scale)
         if self.boxes:
-            files["boxes.urdf"] = boxes_urdf(self.boxes)
+            files["boxes.urdf"] = urdf.boxes_urdf(self.boxes)
         return files
 
 
@@ -123,38 +100,38 @@ def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
         robot: by its maker's description.
         rig: of the set-up; None for the ball on the flange.
     """
-    tree = arm_tree(arm, robot)
+    tree = urdf.arm_tree(arm, robot)
     if rig is None:
-        return {"arm.urdf": text(tree)}
-    (carried,) = (link for link in tree.iter("link") if link.get("name") == BALL_LINK)
+        return {"arm.urdf": urdf.text(tree)}
+    (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
     for visual in carried.findall("visual"):
         carried.remove(visual)
     if rig.hand is None:
         _draw_target(carried, rig, rig.target - arm.tool)
-        return {"arm.urdf": text(tree)}
+        return {"arm.urdf": urdf.text(tree)}
     radius, length = rig.scale * np.array(HOUSING)
     for pose in rig.hand:
         lens = pose[:3, 3] - arm.tool
-        draw_cylinder(carried, DARK_GREY, lens - length * pose[:3, 2], lens, radius)
+        urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
     body = ET.Element("robot", name="target")
     middle = rig.target.mean(axis=0)
-    add_link(body, "world", *BASE_PART)
-    _draw_target(add_link(body, "target", *BASE_PART), rig, rig.target - middle)
-    add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
-    return {"arm.urdf": text(tree), "target.urdf": text(body)}
+    urdf.add_link(body, "world", *urdf.BASE_PART)
+    _draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), rig, rig.target - middle)
+    urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
+    return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
 
 def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
     """Draw ball or plate at points (p, 3) [m] of a link's frame."""
     if len(points) == 1:
-        draw_mesh(link, RED, BALL_MESH, rig.ball_radius)
+        urdf.draw_mesh(link, RED, urdf.BALL_MESH, rig.ball_radius)
         return
     scale = rig.scale
     back, middle = LAYER * scale * _normal(points), points.mean(axis=0)
     for point, colour in zip(points, MARK_COLOURS, strict=False):
-        draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
-        draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
-        draw_cylinder(link, DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+        urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
+        urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
+        urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
 
 
 def _normal(points: FloatArray) -> FloatArray:
@@ -166,15 +143,10 @@ def _normal(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A camera with the whole arm in its image, for films and environments.
+    """A camera with the whole arm in its image, for films and environments."""
 
-    Attributes:
-        camera: its optics.
-        X_BC: (4, 4), its pose in the base frame.
-    """
-
-    camera: PinholeCamera
-    X_BC: FloatArray
+    camera: PinholeCamera  # its optics
+    X_BC: FloatArray  # (4, 4), its pose in the base frame
 
     @classmethod
     def of(cls, scale: float, fineness: float = 1.0) -> Self:

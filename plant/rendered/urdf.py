@@ -177,17 +177,11 @@ def rectangles_obj(rectangles: list[tuple[float, float, float, float]], height: 
 
 
 class Box(NamedTuple):
-    """A box in the room, parallel to the axes of the base frame.
+    """A box in the room, parallel to the axes of the base frame."""
 
-    Attributes:
-        name: in error messages.
-        centre: (3,) [m], base frame.
-        size: (3,) [m], its three sides.
-    """
-
-    name: str
-    centre: tuple[float, float, float]
-    size: tuple[float, float, float]
+    name: str  # in error messages
+    centre: tuple[float, float, float]  # (3,) [m], base frame
+    size: tuple[float, float, float]  # (3,) [m], its three sides
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool) -> str:

@@ -80,19 +80,12 @@ def _pair(link: int, other: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class RenderedState:
-    """A saved state of the world, without handles: any world with the same robot and settings can restore it.
+    """A saved state of the world, without handles: any world with the same robot and settings can restore it."""
 
-    Attributes:
-        joints: angles, speeds and loops of the joints.
-        periods: number of periods since the reset.
-        camera: (4, 4), pose of the first camera.
-        noise: of the detector.
-    """
-
-    joints: Any
-    periods: int
-    camera: FloatArray
-    noise: Any
+    joints: Any  # angles, speeds and loops of the joints
+    periods: int  # number of periods since the reset
+    camera: FloatArray  # (4, 4), pose of the first camera
+    noise: Any  # of the detector
 
 
 class RenderedWorld(World):

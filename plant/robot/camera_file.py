@@ -11,16 +11,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import read_text, read_toml
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import NonNegative, Number, Positive, nested, override, settings
+from servobench.plant.contract.settings import NonNegative, Number, Positive, Usual, nested, override, remark, settings
 from servobench.plant.robot.camera import PinholeCamera
 
 COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3")  # of OpenCV, in its order
@@ -31,6 +31,9 @@ RANGES: Final = {  # of numbers: unit, least and largest
 }  # fmt: skip
 FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of the image
 MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
+MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
+MAX_MOVED: Final = 0.5  # share of its distance from the middle by which a distortion usually moves a point
+MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in files of ROS and OpenCV
     "width": ("image_width", "width"),
@@ -48,7 +51,7 @@ class Place:
 
     frame: Literal["", "base", "flange"] = ""
     """Empty: the bench places it."""
-    position: Row = ()
+    position: tuple[Annotated[Number, Usual(5.0)], ...] = ()
     """[m]"""
 
     def __post_init__(self) -> None:
@@ -70,11 +73,15 @@ class Pose(Place):
     def __post_init__(self) -> None:
         """Check the numbers."""
         super().__post_init__()
-        _ = self.matrix
+        if self.matrix[2, 2] < MIN_AHEAD and self.frame == "flange":
+            wanted = "z is the optical axis, x points right and y down, and a quaternion is x, y, z, w"
+            remark(f"pose.rotation turns the optical axis by more than 60° from the flange's z axis: {wanted}")
 
     @cached_property
     def matrix(self) -> FloatArray:
         """The pose in its frame, (4, 4)."""
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
+
         given = np.array(self.rotation) if len({np.size(row) for row in self.rotation}) == 1 else np.zeros(0)
         pose = np.eye(4)
         if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
@@ -93,9 +100,9 @@ class Pose(Place):
 class Target(Place):
     """Size and place of the target."""
 
-    radius: Positive | None = None
+    radius: Annotated[Positive, Usual(0.5)] | None = None
     """[m] of the ball."""
-    side: Positive | None = None
+    side: Annotated[Positive, Usual(2.0)] | None = None
     """[m] of the plate's square, at the corners of which the discs are."""
 
 
@@ -177,26 +184,25 @@ class OwnCamera:
         return override(str(self.files[0]), usual, changes | ({"feature_noise": keys.noise} if keys.noise else {}))
 
 
-def read_camera(path: Path) -> OwnCamera:
-    """Return the camera of a file.
+def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
+    """Return the camera of a file, or the second one of a stereo pair.
 
     Raises:
         ValueError: a file that cannot be used; one line with its path.
     """
     toml = path.suffix.lower() == ".toml"
     values = read_toml("camera file", path) if toml else {"intrinsics": path.name}
-    try:
-        keys = override("it", CameraFile(), values)
+    values |= {key: in_rows(value) for key, value in values.items() if key == "matrix"}
+    keys = override(f"camera file {path}", CameraFile(), values)
+    if second and keys.second:
+        raise ValueError(f"camera file {path} is the second of a pair and must name no other, got {keys.second}")
+    with configuration_errors(f"camera file {path}: "):
         files = [path, path.parent / keys.intrinsics] if toml and keys.intrinsics else [path]
         if keys.intrinsics:
-            keys = override("it", keys, read_intrinsics(files[-1]))
-        second = read_camera(path.parent / keys.second) if keys.second else None
-        camera = OwnCamera(
-            (*files, *(second.files if second else ())), keys, _matrix(keys), _coefficients(keys), second
-        )
+            keys = override(files[-1].name, keys, read_intrinsics(files[-1]))
+        pair = read_camera(path.parent / keys.second, second=True) if keys.second else None
+        camera = OwnCamera((*files, *(pair.files if pair else ())), keys, _matrix(keys), _coefficients(keys), pair)
         _check(camera)
-    except ValueError as error:
-        raise ValueError(f"camera file {path}: {error}") from error
     return camera
 
 
@@ -225,8 +231,20 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path.name} has no {names[0]}")
         for value in given[:1]:
             keys[key] = value.get("data", []) if isinstance(value, dict) else value
-    numbers = keys["matrix"] if isinstance(keys["matrix"], list) else []
-    return keys | {"matrix": [numbers[row : row + 3] for row in range(0, len(numbers), 3)]}
+    roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
+    parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
+    if any(each not in (None, 0, 1, keys["width"], keys["height"]) for each in parts):
+        remedy = "write size and matrix of the image as it comes into a TOML"
+        raise ValueError(
+            f"{path.name} is of a larger image, of which binning or a region (roi) leaves a part; {remedy}"
+        )
+    return keys | {"matrix": in_rows(keys["matrix"])}
+
+
+def in_rows(value: Any) -> Any:  # noqa: ANN401 - a value of a file
+    """Return a list of nine numbers as three rows, and anything else as it is."""
+    flat = isinstance(value, list) and len(value) == 9
+    return [value[row : row + 3] for row in (0, 3, 6)] if flat else value
 
 
 def _matrix(keys: CameraFile) -> FloatArray:
@@ -238,7 +256,8 @@ def _matrix(keys: CameraFile) -> FloatArray:
             raise ValueError(f"{name} must be given in {unit}, from {least:g} to {most:g}, got {value:g}")
     size = keys.width, keys.height
     if bool(keys.matrix) == (keys.vertical_fov is not None):
-        raise ValueError("one of matrix [px] and vertical_fov [deg] must be given")
+        came = "both" if keys.matrix else "neither"
+        raise ValueError(f"either matrix [px] or vertical_fov [deg] must be given, got {came}")
     f = 0.5 * size[1] / math.tan(math.radians(keys.vertical_fov or 90.0) / 2.0)
     rows = keys.matrix or ((f, 0.0, size[0] / 2.0), (0.0, f, size[1] / 2.0), (0.0, 0.0, 1.0))
     K = np.array(rows) if [len(row) for row in rows] == [3, 3, 3] else np.zeros((3, 3))
@@ -250,6 +269,9 @@ def _matrix(keys: CameraFile) -> FloatArray:
             raise ValueError(f"matrix: a focal length of {f:g} px does not fit a width of {size[0]} px; {wanted}")
     if not ((K[:2, 2] > 0.0) & (K[:2, 2] < size)).all():
         raise ValueError(f"matrix: the principal point {K[:2, 2].tolist()} px must be in the image")
+    if (np.abs(K[:2, 2] / size - 0.5) > MAX_OFF).any():
+        where = f"the principal point {K[:2, 2].tolist()} px is far from the middle of {size[0]} × {size[1]} px"
+        remark(f"matrix: {where}; are cx and cy, or width and height, exchanged?")
     return K
 
 
@@ -280,7 +302,14 @@ def _check(camera: OwnCamera) -> None:
     s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
     far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
     if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
-        raise ValueError(f"distortion {list(camera.distortion)} folds the image before its corners")
+        image = f"an image of {keys.width} × {keys.height} px before its corners"
+        raise ValueError(
+            f"distortion {list(camera.distortion)} folds {image}, with this matrix; take them from one calibration"
+        )
+    squares = np.linspace(0.0, math.hypot(*far) ** 2)
+    if (moved := np.abs(squares * (k1 + squares * (k2 + squares * k3))).max()) > MAX_MOVED:
+        far_away = f"moves points by {moved:.0%} of their distance from the middle"
+        remark(f"distortion {list(camera.distortion)} {far_away}; coefficients of OpenCV are no percent")
     if camera.second is not None:
         pair = [(each.width, each.height, each.pose.frame) for each in (keys, camera.second.keys)]
         if pair[0] != pair[1]:

@@ -19,6 +19,7 @@ Of a URDF, read by yourdfpy, the chain with the most rotating joints is taken, w
 """
 
 import logging
+import re
 from dataclasses import replace
 from math import isfinite, pi
 from pathlib import Path
@@ -28,6 +29,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.contract.settings import (
     Check,
@@ -37,6 +39,7 @@ from servobench.plant.contract.settings import (
     Usual,
     override,
     read_value,
+    remark,
     settings,
 )
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh, rpy_from_rotation
@@ -96,9 +99,11 @@ def _read_calibrated(path: Path) -> Robot:
 Lengths = tuple[Annotated[Number, Ge(-20.0), Le(20.0), Usual(5.0)], ...]
 Twists = tuple[Annotated[Number, Ge(-6.3), Le(6.3)], ...]
 Limits = tuple[Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * pi)], ...]
+Mass = Annotated[Positive, Usual(500.0)]
 LENGTHS: Final = Check.of(Lengths)
 LIMITS: Final = Check.of(tuple[Annotated[Number, Usual(4.0 * pi)], ...])
 SPEEDS: Final = Check.of(tuple[JointSpeed, ...])
+MASS: Final = Check.of(Mass)
 
 
 @settings
@@ -125,9 +130,9 @@ class DhTable:
     """In tables; empty for the file's name."""
     joint_names: tuple[str, ...] = ()
     """An empty list for joint_1, joint_2, …"""
-    mass: tuple[Positive, ...] = ()
+    mass: tuple[Mass, ...] = ()
     """[kg] of the links; an empty list for estimates."""
-    torque: tuple[Positive, ...] = ()
+    torque: tuple[Annotated[Positive, Usual(20_000.0, 0.01)], ...] = ()
     """[Nm] largest of the joints; an empty list for estimates."""
 
 
@@ -144,12 +149,12 @@ def read_dh_robot(path: Path) -> Robot:
     for key in REQUIRED:
         if key not in values:
             raise ValueError(f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}")
+    if "convention" not in values:
+        remark(f'robot file {path} is read by the standard convention; write convention = "standard" or "modified"')
     blank = DhTable((), (), (), (), (), ())
     table = override(f"robot file {path}", blank, values)
-    try:
+    with configuration_errors(f"robot file {path}: "):
         return _robot_of(table, path)
-    except ValueError as error:
-        raise ValueError(f"robot file {path}: {error}") from error
 
 
 def _robot_of(table: DhTable, path: Path) -> Robot:
@@ -160,10 +165,14 @@ def _robot_of(table: DhTable, path: Path) -> Robot:
         as_vector("joint_upper", table.joint_upper, n),
         as_vector("joint_speed", table.joint_speed, n),
     )
-    links = estimate_links(arm, _given("mass", table.mass, n), _given("torque", table.torque, n))
+    mass, torque = (as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque"))
+    links = estimate_links(arm, mass, torque)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     name = table.name or path.stem
-    return Robot(name, name, path.name, arm, limits, links, workspace, note=_estimate_note(table.mass, name))
+    note = (
+        "" if table.mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
+    )
+    return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
 
 
 def _arm_of(table: DhTable) -> SerialArm:
@@ -178,16 +187,8 @@ def _arm_of(table: DhTable) -> SerialArm:
     return replace(arm, joint_offset=as_vector("theta", table.theta, n)) if table.theta else arm
 
 
-def _given(name: str, values: tuple[float, ...], n: int) -> FloatArray | None:
-    return as_vector(name, values, n) if values else None
-
-
-def _estimate_note(mass: tuple[float, ...], name: str) -> str:
-    """Return the line that names the estimated values."""
-    return "" if mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
-
-
 TURNING: Final = ("revolute", "continuous")
+RPY: Final = re.compile(r"""\brpy\s*=\s*["']([^"']*)""")
 DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 
 
@@ -216,7 +217,7 @@ def read_urdf_robot(path: Path, tip: str = "") -> Robot:
         ValueError: the file is missing, malformed, or describes no serial arm with turning joints.
     """
     tree = _read(path)
-    try:
+    with configuration_errors(f"robot file {path}: "):
         chain, flange, tip = _chain(tree, tip)
         names = tuple(link.joint.name for link in chain)
         origins = np.stack([*(link.origin for link in chain), flange])
@@ -227,8 +228,6 @@ def read_urdf_robot(path: Path, tip: str = "") -> Robot:
         arm, limits = with_ball(bare), _limits(chain)
         links, note = _links(tree, chain, arm)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
-    except ValueError as error:
-        raise ValueError(f"robot file {path}: {error}") from error
     lines = [f"{path.name}: {n} joints from {names[0]} to {names[-1]}, the ball on {tip}", *([note] if note else [])]
     return Robot(path.stem, str(tree.name), path.name, arm, limits, links, workspace, note="; ".join(lines))
 
@@ -253,11 +252,14 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
             str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
         ).robot
     except Exception as error:  # noqa: BLE001 - the line repeats any error
-        said.append(str(error) or type(error).__name__)
+        said.append(f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__)
     finally:
         log.removeFilter(collect)
     if said:
         raise ValueError(f"robot file {path} is no URDF, with a <robot> as its root: {' '.join(said[0].split())}")
+    turns = " ".join(RPY.findall(path.read_text(encoding="utf-8", errors="replace"))).split()
+    if large := [turn for turn in turns if abs(float(turn)) > 7.0]:
+        remark(f"robot file {path} has an rpy of {large[0]}, and angles of a URDF are in rad")
     return read
 
 
@@ -285,6 +287,8 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
         pose = pose @ _pose(joint.origin)
         read_value(f"joint {joint.name!r}: origin", tuple(pose[:3, 3].tolist()), LENGTHS, lambda: "m")
         if _turns(joint):
+            if not np.any(joint.axis):
+                raise ValueError(f"joint {joint.name!r} turns about the axis 0 0 0; the usual one is 0 0 1")
             aligned = _along(np.asarray(joint.axis, dtype=np.float64))
             chain.append(Joint(joint, pose @ aligned, aligned))
             pose = aligned.T
@@ -326,21 +330,24 @@ def _along(axis: FloatArray) -> FloatArray:
 
 def _limits(chain: list[Joint]) -> JointLimits:
     """Return the limits; soft limits of a safety controller count where they are narrower."""
-    rows = []
+    rows, lacking = [], list[str]()
     for link in chain:
-        limit, safety = link.joint.limit, link.joint.safety_controller
-        lower, upper, speed = -2 * pi, 2 * pi, DEFAULT_SPEED
-        if limit is not None:
-            if link.joint.type != "continuous" and limit.lower is not None and limit.upper is not None:
-                lower, upper = limit.lower, limit.upper
-            speed = limit.velocity or speed
-        if safety is not None and link.joint.type != "continuous":
+        limit, safety, endless = link.joint.limit, link.joint.safety_controller, link.joint.type == "continuous"
+        ranged = limit is not None and limit.lower is not None and limit.upper is not None
+        lower, upper = (limit.lower, limit.upper) if ranged and not endless else (-2 * pi, 2 * pi)
+        speed = 0.0 if limit is None else limit.velocity or 0.0
+        given = {"range": ranged or endless, "velocity": speed}
+        lacking += [f"{word} of {link.joint.name}" for word in given if not given[word]]
+        speed = speed or DEFAULT_SPEED
+        if safety is not None and not endless:
             lower = max(lower, lower if safety.soft_lower_limit is None else safety.soft_lower_limit)
             upper = min(upper, upper if safety.soft_upper_limit is None else safety.soft_upper_limit)
         name = f"joint {link.joint.name!r}"
         read_value(f"{name}: limits", (float(lower), float(upper)), LIMITS, lambda: "rad")
         read_value(f"{name}: velocity", (float(speed),), SPEEDS, lambda: "rad/s")
         rows.append((lower, upper, speed))
+    if lacking:
+        remark(f"limits that the URDF lacks are taken as ±2π rad and π rad/s: {', '.join(lacking)}")
     lowers, uppers, speeds = np.array(rows, dtype=np.float64).T
     return JointLimits(lowers, uppers, speeds)
 
@@ -355,6 +362,8 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     if any(inertial is None or not inertial.mass for inertial in own):
         return estimate_links(arm, torque=torque), f"estimated: masses, inertia{', torque limits' if missing else ''}"
     mass = np.array([inertial.mass for inertial in own], dtype=np.float64)
+    for link, each in zip(chain, mass.tolist(), strict=True):
+        read_value(f"link {link.joint.child!r}: mass", each, MASS, lambda: "kg")
     poses = [link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)]
     centre = np.array([pose[:3, 3] for pose in poses])
     inertia = np.array(

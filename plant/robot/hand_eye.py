@@ -14,7 +14,6 @@ from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.signals import BoolArray, Channel, PlantSpec
@@ -106,6 +105,13 @@ class RobotModel(ABC):
         return self.with_camera(turn_about(self.camera, rotation, self.pivot(centre)))
 
 
+def rotation_matrix(vector: npt.ArrayLike) -> FloatArray:
+    """Return the matrices, (..., 3, 3), of rotation vectors, (..., 3) rad."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
+
+    return np.asarray(Rotation.from_rotvec(np.asarray(vector)).as_matrix())
+
+
 def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> FloatArray:
     """Return a pose, (4, 4), turned by a rotation vector of its own frame, (3,) rad, about a `point` (3,) m.
 
@@ -113,7 +119,7 @@ def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> Flo
     """
     own = pose[:3, :3].T @ (point - pose[:3, 3])
     turned = np.eye(4)
-    turned[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
+    turned[:3, :3] = pose[:3, :3] @ rotation_matrix(rotation)
     turned[:3, 3] = point - turned[:3, :3] @ own
     return turned
 

@@ -18,7 +18,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, plus_diagonal, transposed
@@ -169,6 +168,8 @@ def reach_pose(
 
 def _pose_error(arm: SerialArm, pose: FloatArray, q: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
     """Return the error, (6,), and the geometric Jacobian, (6, n), with lengths over that of the arm."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
+
     frames = arm.frames(q)
     flange, axes = frames[-1], frames[: arm.n, :3, 2] * arm.gear_ratio[:, None]
     turn = Rotation.from_matrix(pose[:3, :3] @ flange[:3, :3].T).as_rotvec()

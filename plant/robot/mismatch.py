@@ -163,7 +163,7 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         ValueError: an unknown axis, a malformed or an empty range, or a magnitude out of its bounds.
     """
     if axis not in AXES:
-        raise ValueError(f"unknown mismatch axis {axis!r}: {suggest(axis, AXES)}")
+        raise ValueError(f"unknown mismatch axis {axis!r} (a setting is as kinematic.lag): {suggest(axis, AXES)}")
     example = RANGES[re.sub("[0-9.]", "", AXES[axis][1])]
     number = r"[0-9]*\.?[0-9]+"
     match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
@@ -201,7 +201,12 @@ def _range(name: str, text: str, begin: float, end: float, step: float) -> list[
         raise ValueError(f"the range {text!r} of {name} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
     if steps < 0.0:  # it begins beyond its end
         raise ValueError(f"the range {text!r} of {name} is empty")
-    return [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
+    values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
+    if steps - math.floor(steps) > 1e-6:
+        raise ValueError(
+            f"the range {text!r} of {name} must be begin:end:step, but its last step ends at {values[-1]:g}"
+        )
+    return values
 
 
 @dataclass(frozen=True)

@@ -170,6 +170,13 @@ def test_robots_too_few_for_a_rule_decide_nothing(claim, changes, verdict):
     assert verdicts(made)[claim] == verdict
 
 
+def test_where_no_run_reached_its_last_period_nothing_is_answered():
+    made = tables()
+    made[TIMED] = made[TIMED].assign(status="crashed").drop(columns="settling_time_s")
+    with pytest.raises(ConfigurationError, match=f"no run of {TIMED} on kinematic reached its last period"):
+        answer_all(made, "kinematic")
+
+
 @pytest.mark.parametrize(("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)])
 def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, number, same):
     answer = answer_all(tables(), "kinematic")[0]

@@ -56,6 +56,16 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
         pd.testing.assert_frame_equal(single, double, check_exact=True)
 
 
+def test_a_run_without_figures_leaves_its_tables_only(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ("run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--no-figures")
+    assert servobench(monkeypatch, *arguments, "--out", str(out)) == 0
+    assert f"tables in {out}" in " ".join(capsys.readouterr().out.split())
+    assert sorted(path.name for path in out.iterdir()) == [
+        "SHA256SUMS", "manifest.json", "runs.parquet", "steps.parquet",
+    ]  # fmt: skip
+
+
 def test_a_command_that_is_started_with_interrupts_ignored_can_be_interrupted(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -39,6 +39,24 @@ finally:
     assert done.stderr == ""
 
 
+def test_lists_load_no_tables_pictures_or_engines():
+    unused = {"scipy", "pandas", "matplotlib", "pybullet", "mujoco", "cv2"}
+    script = f"""
+import sys
+from servobench.harness.cli.main import main
+for listed in ("controllers", "tasks"):
+    sys.argv = ["servobench", listed]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code
+sys.stderr.write(' '.join(sorted(set(sys.modules) & {unused!r})))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "ukf_mfac" in done.stdout
+    assert done.stderr == ""
+
+
 def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
     done = servobench_without(EXTRAS, (*QUICK, "--report"), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kit.command import servobench
 from kit.controller_fmus import exported
 from kit.foreign_fmu import build_crane, build_pilot, mapping
 from servobench.harness.batch.api import run
@@ -14,6 +15,7 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 SETTINGS = {"kinematic": {"sensing": {"drop_probability": 0.05}}}
 MAPPING = """
@@ -103,6 +105,7 @@ def test_a_foreign_controller_and_a_foreign_plant_close_a_loop_without_code(tmp_
             "joints must name 6 numbers for 6 joints and 3 features, got 3",
         ),
         (MAPPING.replace('joints = ["joint_position"]', 'joints = ["joint_velocity_command"]'), "causality output"),
+        (MAPPING.replace('"reference"', '"feature"'), r"reference and features both name the input 'feature\[1\]'"),
         (MAPPING.replace("outputs =", "output ="), "the key 'outputs' is missing"),
         (MAPPING.replace("map.fmu", "none.fmu"), "none.fmu"),
     ],
@@ -113,6 +116,27 @@ def test_a_bad_mapping_is_refused_by_a_line(tmp_path, text, message):
     with pytest.raises(ConfigurationError, match=message) as refused:
         build(resolve(RunRequest("kinematic", f"fmu:{tmp_path / 'bad.toml'}", "target", "none", 1), Settings()))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "period", "message"),
+    [
+        (MAPPING, 0.02, "map.fmu is meant for a period of 0.05 s, and run.period is 0.02 s"),
+        (MAPPING.replace("joints =", "# joints ="), 0.05, "no role of the mapping names the input joint_position[1]"),
+    ],
+)
+def test_an_unlikely_mapping_is_remarked_on_by_the_process_that_the_user_sees(
+    tmp_path, monkeypatch, caplog, text, period, message
+):
+    (tmp_path / "map.fmu").write_bytes(exported("ukf_mfac:published", 2).read_bytes())
+    (tmp_path / "mine.toml").write_text(text)
+    settings = "--set", "target.duration=0.2", "--set", f"run.period={period}", "--out", str(tmp_path / "out")
+    name = str(tmp_path / "mine.toml")
+    remark.cache_clear()
+    assert (
+        servobench(monkeypatch, "run", "--controller", name, "--plant", "kinematic", "--task", "target", *settings) == 0
+    )
+    assert sum(message in line for line in caplog.messages) == 1
 
 
 def test_an_fmu_without_the_names_of_exported_controllers_asks_for_a_mapping(tmp_path):

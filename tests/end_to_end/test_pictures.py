@@ -335,7 +335,7 @@ def test_a_figure_for_tex_has_the_width_of_the_column(monkeypatch, tmp_path):
         (("--width", "3.5"), "--width must be from 2in to 20in, as 3.5in, 89mm or 252pt, got 3.5"),
         (("--format", "eps"), "--format: unknown 'eps': "),
         (("--format", "pgf"), "--format pgf needs a TeX while it is drawn, pdflatex, lualatex or xelatex, and there"),
-        (("--kind", "tracking"), "has no figure of tracking"),
+        (("--kind", "tracking"), "has no figure of tracking: errors and paths are of moves, tracking is of curves"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(monkeypatch, capsys, tmp_path, arguments, line):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -59,6 +60,54 @@ def test_a_killed_sweep_that_is_resumed_gives_the_table_of_an_undisturbed_one(un
     assert 0 < len(results.load_runs(out)) < RUNS
     assert servobench(monkeypatch, *SWEEP, "--out", str(out), "--resume") == 0
     assert_same_runs(out, undisturbed)
+
+
+def parts(tmp_path, monkeypatch, count: int, chosen: Iterable[int]) -> list[str]:
+    folders = [str(tmp_path / f"{number}") for number in chosen]
+    for folder in folders:
+        division = f"{Path(folder).name}/{count}"
+        assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--part", division, "--out", folder) == 0
+    return folders
+
+
+@pytest.mark.parametrize("count", [2, 7])
+def test_parts_are_merged_into_the_table_of_an_undivided_sweep(count, undisturbed, tmp_path, monkeypatch):
+    folders = parts(tmp_path, monkeypatch, count, range(count, 0, -1))
+    assert servobench(monkeypatch, "merge", *folders, "--out", str(tmp_path / "merged")) == 0
+    assert_same_runs(tmp_path / "merged", undisturbed)
+    assert servobench(monkeypatch, "verify", str(tmp_path / "merged")) == 0
+
+
+def test_runs_of_a_part_that_is_missing_are_carried_out_in_the_merged_folder(
+    undisturbed, tmp_path, monkeypatch, capsys
+):
+    folders, merged = parts(tmp_path, monkeypatch, 3, (1, 3)), str(tmp_path / "merged")
+    assert servobench(monkeypatch, "merge", *folders, "--out", merged) == 0
+    assert "32 of 48 runs are there: --resume carries out the others" in capsys.readouterr().out
+    assert servobench(monkeypatch, *SWEEP, "--out", merged, "--resume") == 0
+    assert_same_runs(tmp_path / "merged", undisturbed)
+
+
+def test_folders_that_are_no_parts_of_one_batch_are_not_merged(undisturbed, tmp_path, monkeypatch, capsys):
+    part, other = *parts(tmp_path, monkeypatch, 3, (1,)), str(tmp_path / "other")
+    servobench(monkeypatch, *SWEEP, "--seeds", "5", "--part", "1/9", "--out", other)
+    capsys.readouterr()
+    wrong = {
+        part: "have the same runs: leave one away",
+        str(undisturbed): "nothing to be merged",
+        other: "seeds 0:5 there",
+    }
+    for folder, words in wrong.items():
+        assert servobench(monkeypatch, "merge", part, folder, "--out", str(tmp_path / "merged")) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "merged").exists()
+
+
+@pytest.mark.parametrize("part", ["0/3", "4/3", "3", "a/b", "1/49"])
+def test_a_part_that_there_is_not_is_refused(part, tmp_path, monkeypatch, capsys):
+    assert servobench(monkeypatch, *SWEEP, "--part", part, "--out", str(tmp_path / "out")) == 2
+    assert "part" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(undisturbed, tmp_path, monkeypatch):

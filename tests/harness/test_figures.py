@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
@@ -16,7 +17,7 @@ from servobench.harness.batch import results
 from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
-from servobench.harness.pictures.style import SETTLED, divisions, method_styles
+from servobench.harness.pictures.style import SETTLED, divisions, figure_style, method_styles, save_figure
 from servobench.harness.pictures.tracks import Track, load_ensembles, quantile, shown_until
 
 STYLES = method_styles(METHODS)
@@ -194,3 +195,10 @@ def test_moves_that_never_settled_stand_at_the_edge_and_are_counted():
 def test_only_curves_with_the_same_intervals_are_one_line():
     one, other = Estimate(100.0, 88.0, 100.0, 30), Estimate(100.0, 44.0, 100.0, 3)
     assert same_curves({"a": [one, one], "b": [one, other], "c": [one, one]}) == [["a", "c"], ["b"]]
+
+
+def test_a_name_that_the_font_lacks_is_drawn_without_a_word(tmp_path):
+    with figure_style():
+        figure = Figure()
+        figure.text(0.5, 0.5, "\x00\U0001f600")
+    assert [path.name for path in save_figure(figure, tmp_path / "a", ["png"])] == ["a.png"]

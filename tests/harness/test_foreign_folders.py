@@ -244,11 +244,19 @@ def differing_parts(folder: Path) -> None:
         (folder / name).unlink()
 
 
+def large_numbers(folder: Path) -> None:
+    """Put a whole number into one part that has no place among the floats of the other."""
+    differing_parts(folder)
+    name = results.part_name(1, results.STEPS)
+    write_vouched(folder, {name: pd.read_parquet(folder / name).assign(jacobian_error=2**63 - 1).to_parquet})
+
+
 def table_beside(table: pa.Table) -> Callable[[Path], object]:
     return lambda folder: pa.parquet.write_table(table, folder / "more.parquet")
 
 
 runs, steps = partial(rewritten, results.RUNS), partial(rewritten, results.STEPS)
+LATEX = "statistics {} --latex"
 FIGURE = "figures {} --kind errors --format svg"
 EXPORT, MCAP = "export {} --out out", "export {} --out out --format mcap"
 ODD = {  # what a folder holds: the command, its exit code, and words of its one line
@@ -263,10 +271,16 @@ ODD = {  # what a folder holds: the command, its exit code, and words of its one
     "steps at no time": (steps(lambda old: old.assign(time_s=np.nan)), MCAP, 2, "steps at no time"),
     "steps without a number": (steps(lambda old: old.assign(jacobian_error=None)), MCAP, 0, ""),
     "columns of several types": (differing_parts, "collect {}", 2, "Unable to merge"),
+    "numbers that are no floats": (large_numbers, "collect {}", 2, "not in range"),
     "a part behind the last run": (part_behind_the_last_run, "verify {}", 1, "holds more runs than the batch has"),
     "a camera that moves at a word": (manifest(configuration={"run": {"camera_moves_at": "noon"}}), FIGURE, 0, ""),
     "lists in lists": (lists_in_lists, "report {}", 2, "nested too deeply"),
     "code that is a list": (manifest(plugins=[1]), "statistics {}", 2, "plugins must be an object of an object"),
+    "changes that are none": (manifest(changed=1.5), LATEX, 2, "changed must be an object, got '1.5'"),
+    "a version that is a command": (
+        manifest(robots=[{}], packages={"servobench": r"\input{x}"}), LATEX, 0, r"\textbackslash{}input\{x\}~",
+    ),
+    "a pipe for a lock": (lambda folder: os.mkfifo(folder / ".lock"), "verify {}", 2, "a results folder holds files"),
     "words for pandas": (hostile_metadata, "verify {}", 1, "nothing vouches"),
     "a table beside that is a bomb": (table_beside(BOMB), "report {}", 2, "it unpacks to 3e+07 cells"),
     "a table beside with lists": (table_beside(pa.table({"a": [[1, 2], [3]]})), "report {}", 0, ""),

@@ -296,6 +296,16 @@ def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for
     assert_same(folder, whole)
 
 
+@pytest.mark.parametrize("base", ["half", "whole"])
+def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(base, whole, tmp_path, request):
+    folder = copy(request.getfixturevalue(base), tmp_path)
+    (folder / SUMS).write_bytes(b"\0" * 9)
+    with pytest.raises(ConfigurationError, match="are not of this batch or do not say so"):
+        run(folder, resume=True, seeds=range(5))
+    assert run(folder, resume=True).repeated == len(results.load_runs(whole))
+    assert_same(folder, whole)
+
+
 @pytest.mark.parametrize("what", DAMAGES)
 def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(
     half, whole, tmp_path, what

@@ -131,3 +131,12 @@ def test_a_folder_that_was_removed_is_noticed(tmp_path):
         with locked(out), pytest.raises(FileNotFoundError, match="removed by another process"):
             lock.check()
     assert out.is_dir()
+
+
+def test_a_lock_that_is_a_second_name_of_a_file_elsewhere_changes_no_such_file(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "mine").write_text("precious")
+    os.link(tmp_path / "mine", tmp_path / "out" / LOCK)
+    with locked(tmp_path / "out") as taken:
+        taken.check()
+    assert (tmp_path / "mine").read_text() == "precious"

@@ -59,3 +59,9 @@ def test_a_batch_tells_its_runs_in_a_pipe_and_draws_a_bar_in_a_terminal(capsys, 
         observer.finished([{}] * 10)
         observer.close()
         assert capsys.readouterr().err == wanted
+
+
+def test_a_note_is_neither_markup_nor_words_for_the_terminal():
+    console = piped()
+    ConsoleObserver(console).note("left by [/red] of a\x1b[2J")
+    assert console.file.getvalue() == "left by [/red] of a\\u001b[2J\n"

@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.command import servobench
-from kit.folders import comparison, made_up_row, made_up_steps, write_folder
+from kit.folders import comparison, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import (
     cost_table,
@@ -31,7 +33,7 @@ from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
-from servobench.plant.contract.checksums import SUMS
+from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest, write_atomically
 
@@ -155,6 +157,45 @@ def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
         results.collect(tmp_path)
 
 
+def without_steps(folder: Path) -> None:
+    sweep(folder)
+
+
+def without_file(name: str) -> Callable[[Path], None]:
+    return lambda folder: (comparison(folder, controllers=("constant",), tasks=("exp1",)) / name).unlink()
+
+
+def of_schema_3(folder: Path) -> None:
+    manifest = comparison(folder, controllers=("constant",), tasks=("exp1",)) / results.MANIFEST
+    manifest.write_text(manifest.read_text().replace('"schema_version": "4"', '"schema_version": "3"'))
+    (folder / SUMS).unlink()
+
+
+@pytest.mark.parametrize(
+    ("make", "command", "words"),
+    [
+        (without_steps, "shadow DIR --controller constant", "DIR holds no steps: a sweep keeps none; use run or c"),
+        (without_steps, "record DIR", "DIR holds no steps: a sweep keeps none"),
+        (without_steps, "export DIR --out new", "DIR holds no steps: a sweep keeps none"),
+        (without_steps, "figures DIR --kind errors", "DIR holds no steps: a sweep keeps none"),
+        (without_file(results.STEPS), "export DIR --out new", "DIR/steps.parquet is missing; repeat the command"),
+        (without_file(results.STEPS), "figures DIR", "DIR/steps.parquet is missing; repeat the command"),
+        (without_file(results.RUNS), "statistics DIR", "DIR/runs.parquet is missing; repeat the command"),
+        (of_schema_3, "verify DIR", "DIR has results of schema '3'; this servobench reads '4'; the column"),
+        (lambda folder: None, "statistics DIR", "DIR is not a results folder: it does not exist"),
+        (lambda folder: None, "verify DIR", "DIR is not a results folder: it does not exist"),
+    ],
+)  # fmt: skip
+def test_what_a_folder_lacks_is_named(monkeypatch, capsys, tmp_path, make, command, words):
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path / "DIR")
+    assert servobench(monkeypatch, *command.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"servobench: {words}")
+    assert said.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
 def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):
     point_latest(folder)
     newer = folder.parent / "newer"
@@ -240,6 +281,10 @@ def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, mon
     groups = list(results.iterate_runs(folder, ["seed", "no such column"]))
     assert [list(group.columns) for group in groups] == [["seed"]] * 3
     assert [group["seed"].tolist() for group in groups] == [[0, 1], [2, 3], [4]]
+    changed = results.load_runs(folder).drop(columns="controller")
+    write_vouched(folder, {results.RUNS: changed.to_parquet})
+    with pytest.raises(ConfigurationError, match="it lacks the column controller"):
+        results.iterate_runs(folder, ["seed"])
 
 
 def read_runs(folder):

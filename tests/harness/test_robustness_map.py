@@ -90,7 +90,7 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
         ]
     )  # fmt: skip
     figures = []
-    monkeypatch.setattr(robustness, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
+    monkeypatch.setattr(robustness.style, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
     draw_map(runs, tmp_path, limits)
     lines = [np.asarray(each.get_xdata()) for each in figures[0].axes[0].get_lines()]
     upright = [x[0] for x in lines if len(x) == 2 and x[0] == x[1]]
@@ -124,7 +124,7 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
         ]
     )  # fmt: skip
     figures = []
-    monkeypatch.setattr(robustness, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
+    monkeypatch.setattr(robustness.style, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
     draw_map(runs, tmp_path)
     success = figures[0]
     assert [axes.get_xlabel() for axes in success.axes] == ["sensor noise [times the usual]"]

@@ -294,6 +294,13 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     assert files == {str(file): hashlib.sha256(OWN.encode()).hexdigest()}
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")
+    axis_first = OWN.replace("axis=-1", "axis=0")
+    assert axis_first != OWN
+    file.write_text(axis_first)
+    with pytest.raises(
+        ConfigurationError, match=r"side.py: measure must return 3 features along .*, got the shape \(3, 2\)"
+    ):
+        run_experiment(request(str(file)), Settings({}))
     (tmp_path / "none.py").write_text("x = 1\n")
     with pytest.raises(ConfigurationError, match="defines no sensing set-up"):
         find_sensing(str(tmp_path / "none.py"))

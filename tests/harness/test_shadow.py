@@ -147,6 +147,9 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
     "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
     "sign": (JOINTS, np.negative, "move otherwise than this robot's at these joints", False),
     "kilometres": (FEATURES, lambda y: y / 1000.0, "move otherwise than this robot's at these joints", False),
+    "arm": (JOINTS, lambda q: q[:, [2, 1, 0, 3, 4, 5]], "move otherwise than this robot's at these joints", False),
+    "answers": ("feature_valid", lambda valid: np.full(valid.shape, "no"), "feature_valid must be a finite", True),
+    "lost": ("feature_valid", np.zeros_like, "no row whose feature_valid is 1 or true", True),
     "speeds": (COMMAND, np.degrees, "if they are in deg/s, write them in rad/s", False),
 }
 
@@ -173,6 +176,21 @@ def test_a_log_in_other_units_is_not_shown_in_silence(lap, tmp_path, caplog, sli
         return
     show(table, tmp_path / "log.csv")
     assert re.search(message, caplog.text)
+
+
+def test_joint_positions_in_the_columns_of_commands_are_remarked_on(lap, tmp_path, caplog):
+    remark.cache_clear()
+    joints = [name for name in lap if name.startswith(JOINTS)]
+    positions = {name.replace(JOINTS, f"{COMMAND}_") + "_s": lap[name] for name in joints}
+    show(lap.assign(**positions), tmp_path / "log.csv")
+    assert "commands of the log are its joint positions, and wanted are velocities" in caplog.text
+
+
+def test_another_robot_than_that_of_a_folder_is_refused(folder, monkeypatch, capsys):
+    assert servobench(monkeypatch, "shadow", str(folder), "--robot", "ur10e") == 2
+    assert "--robot ur10e is not that of the run, ur5; leave it out for a folder" in capsys.readouterr().err
+    assert servobench(monkeypatch, "shadow", str(folder), "--sensing", "pixel") == 2
+    assert "--sensing pixel is not that of the run, position" in capsys.readouterr().err
 
 
 def test_a_log_of_another_true_robot_and_a_late_camera_is_shown_without_a_remark(tmp_path, caplog):

@@ -233,6 +233,7 @@ def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path)
         ["camera_rotation=30deg", "1", "–", "66.7", "66.7", "66.7", "6"],
         ["camera_rotation=60deg", "1", "–", "50.0", "50.0", "60.0", "6"],
     ]
+    assert dict(sweep_tables([wanted.drop(columns="latency_s")]))[title].equals(table)
 
 
 def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither(tmp_path):

@@ -95,6 +95,23 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("return Scenario", "Scenario"), "its method scenario must return a servobench.Scenario, got None"),
+        (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at each .*, got .*nan"),
+        (
+            ("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
+            r"its .* 3 finite features .*got shape \(12, 2\)",
+        ),
+    ],
+)
+def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, change, words):
+    write(tmp_path, "from servobench.harness.run.references import FixedPoint\n" + SPIRAL.replace(*change), "spiral.py")
+    with pytest.raises(ConfigurationError, match=f"^task Spiral: {words}"):
+        servobench.run("constant", task="./spiral.py")
+
+
 def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_path):
     broken = SPIRAL.replace("        times =", '        raise ValueError("the spiral is too tight")\n        times =')
     write(tmp_path, broken, "spiral.py")

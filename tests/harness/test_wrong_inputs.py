@@ -5,14 +5,25 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kit.command import servobench
 from kit.folders import comparison
+from kit.robots import FOUR_JOINTS
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import build_once
+from servobench.harness.run.references import FixedPoint
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
+from servobench.harness.run.scenario import Scenario
+from servobench.plant.contract.settings import remark
 
 RUN = ("run", "--plant", "kinematic", "--controller", "constant")
 COMPARE = ("compare", "--controllers", "constant", "--tasks", "exp2")
 SWEEP = ("sweep", "--controllers", "constant", "--out", "new")
+CAMERA = "width = 640\nheight = 480\nvertical_fov = 60.0\n"
+INFO = "width: 640\nheight: 480\nk: [615, 0, 320, 0, 615, 240, 0, 0, 1]\n"
 FILES: dict[str, str | bytes] = {  # name -> content
     "unknown_section.toml": "[kinematc]\nlag = 0.1\n",
     "bad_value.toml": "[ukf_mpc.law]\nhorizon_time = -1\n",
@@ -20,11 +31,19 @@ FILES: dict[str, str | bytes] = {  # name -> content
     "text.csv": "time_s,x_m,y_m,z_m\n0,0,0,far\n",
     "backwards.csv": "time_s,x_m,y_m,z_m\n1,0,0,1.2\n0,0,0,1.2\n",
     "columns.csv": "t,x,y,z\n0,0,0,1.2\n",
+    "clock.csv": "time_s,x_m,y_m,z_m\n1760000000,0,0,1.25\n1760000002,0,0,1.25\n",
     "semicolons.csv": "time_s;x_m;y_m;z_m\n0;0,5;0;1,25\n",
     "decimal_commas.csv": "time_s,x_m,y_m,z_m\n0,0,0,5,0,0,1,25\n",
     "empty.csv": "",
     "utf_16.toml": "[kinematic]\nlag = 0.1\n".encode("utf-16"),
     "far.csv": "time_s,x_m,y_m,z_m\n0,0,0,1.25\n5,0,9,1.25\n",
+    "before.csv": "time_s,x_m,y_m,z_m\n-1,0,0,1.2\n1,0,0,1.2\n",
+    "slow.csv": "time_s,x_m,y_m,z_m\n0,0,0,1.25\n6000,0,0.1,1.25\n",
+    "fast.csv": "time_s,x_m,y_m,z_m\n0,0,0,1.25\n0.05,0,0.3,1.25\n",
+    "self.toml": f'second = "self.toml"\n{CAMERA}',
+    "binned.yaml": f"{INFO}binning_x: 2\nbinning_y: 2\n",
+    "part.yaml": f"{INFO}roi: {{width: 320, height: 240}}\n",
+    "twice.toml": FOUR_JOINTS + 'joint_names = ["a", "b", "c", "a"]\n',
     "list.yaml": "kinematics:\n  - 1\n",
     "arm_mm.toml": "a = [0, -425]\nd = [0, 0]\nalpha = [0, 0]\njoint_lower = []\njoint_upper = []\njoint_speed = []\n",
     "no.fmu": "this is no archive",
@@ -35,6 +54,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("run", "--plant", "kinematik"), "unknown plant 'kinematik': did you mean 'kinematic'?"),
     (("run", "--plant", "fmu:"), "mapping . cannot be read"),
     (("run", "--plant", "fmu:none.toml"), "none.toml"),
+    (("run", "--plant", "none.toml"), "mapping none.toml cannot be read: No such file"),
+    (("run", "--plant", "no.fmu"), "plant no.fmu needs a mapping, a TOML that names file, inputs"),
     (("run", "--plant", "fmu:no_fmu.toml"), "no_fmu.toml"),
     (("run", "--controller", "ukf_mfca"), "unknown controller 'ukf_mfca': did you mean 'ukf_mfac'?"),
     (("run", "--controller", "mfac"), "unknown controller 'mfac': it is a law and makes a pair, such as mfac+ukf"),
@@ -103,6 +124,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=text.csv"), "row 0: z_m must be a finite number, got 'far"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=backwards.csv"), "waypoint times must ascend"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=columns.csv"), "has no column time_s; it needs time_s"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=clock.csv"), "clock.csv begins at 1760000000 s; write"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=semicolons.csv"), "has ';' between its columns; write"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=decimal_commas.csv"), "more cells than its header"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=empty.csv"), "waypoint file empty.csv is no table"),
@@ -130,7 +152,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*COMPARE, "--scheduler", "tcp://x:1", "--workers", "2"), "--workers are processes of this machine"),
     # sweeps
     ((*SWEEP, "--out", "full"), "exists already; name another one with --out, or continue its batch with --resume"),
-    ((*SWEEP, "--vary", "camera_rotaton=0:30:10deg"), "unknown mismatch axis 'camera_rotaton': did you mean"),
+    ((*SWEEP, "--vary", "camera_rotaton=0:30:10deg"), "unknown mismatch axis 'camera_rotaton' (a setting is as"),
+    ((*SWEEP, "--vary", "lag=0.1,0.2"), "unknown mismatch axis 'lag' (a setting is as kinematic.lag): valid: backlash"),
     ((*SWEEP, "--vary", "links=5"), "links must be at least 0 and below 1, got 5; if 5% is meant, write the unit, too"),
     ((*SWEEP, "--vary", "links"), "--vary: links needs begin:end:step with a unit, such as links=0:30:10%"),
     ((*SWEEP, "--vary", "links=5/5%"), "twice"),
@@ -188,6 +211,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("shadow", "columns.csv", "--controller", "constant"), "log columns.csv has no column time_s; it needs time_s"),
     (("shadow", "text.csv", "--controller", "constant", "--sensing", "pixl"), "did you mean 'pixel'?"),
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "it holds something that is no formula"),
+    (("fmu", "export", "--controller", "mfac+rls", "--sensing", "plate", "-o", "new.fmu"), "plate, but perhaps with"),
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
     (("fmu", "export", "-o", "none/new.fmu"), "the folder none for the FMU does not exist"),
@@ -205,6 +229,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--config", "full"), "configuration file full cannot be read"),
     ((*RUN, "--out", "a" * 300), "cannot be written: File name too long"),
     ((*RUN, "--run-memory", "-1GB"), "a memory limit is a size such as 500MB or 2GB"),
+    (("new", "my_law"), "'my_law' is nothing to begin with; the command is servobench new controller NAME or"),
     (("new", "controller", "../mine"), "the name must be one of a Python module, such as my_law, got '../mine'"),
     # one line of each further refusal
     ((*SWEEP, "--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
@@ -216,7 +241,53 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("tune", "--search", "-1"), "search must be at least 0, got -1"),
     (("tune", "--robots", "8000"), "64000 seeds from 10000 on leave the tuning range 10000:20000"),
     (("tune", "--study-seed", "-1"), "study_seed must be at least 0, got -1"),
+    # inputs that would lose data, or have no effect
+    ((*RUN, "--robot", "twice.toml"), "each joint and feature needs a name of its own, got a, b, c, a"),
+    ((*RUN, "--sensing", "stereo", "--camera", "self.toml"), "is the second of a pair and must name no other"),
+    ((*RUN, "--sensing", "pixel", "--camera", "binned.yaml"), "binning or a region (roi) leaves a part; write"),
+    ((*RUN, "--sensing", "pixel", "--camera", "part.yaml"), "part.yaml is of a larger image"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=before.csv"), "times must ascend, the first one from 0 s"),
+    ((*SWEEP, "--vary", "camera_rotation=0:180:50deg"), "must be begin:end:step, but its last step ends at 150"),
+    ((*SWEEP, "--vary", "camera_rotation=0:30:180deg"), "must be begin:end:step, but its last step ends at 0"),
+    ((*SWEEP, "--vary", "plant.lag=0:1:0.3"), "but its last step ends at 0.9"),
+    (("shadow", "text.csv", "--controller", "constant", "--out", "./text.csv"), "text.csv is the log itself; name"),
+    (("shadow", "text.csv", "--controller", "constant", "--run", "a"), "--run names a run of a results folder, and"),
+    (("shadow", "text.csv", "--controller", "calibrated"), "is given the true robot, which text.csv does not"),
+    (("fmu", "export", "-o", "arm"), "--output must end in .fmu, got arm"),
+    (("fmu", "export", "-o", "x.fmu", "--controller", "broyden", "--seed", "3"), "--mismatch and --seed are for an"),
+    (("fmu", "export", "-o", "x.fmu", "--mismatch", "outliers=40%"), "is exported without outliers: leave it out"),
+    (("fmu", "export", "-o", "x.fmu", "--mismatch", "camera_move=9deg"), "an arm is exported without camera_move"),
+    (("init", "-", "--plants", "kinematic", "--set", "bullet.lag=0.2"), "'bullet' does not run here"),
+    (("new", "controller", "numpy"), "a Python package is called numpy, which a file of this name would hide"),
+    (("statistics", "results", "--metric", "seed"), "the table has no column of numbers 'seed'"),
+    (("figures", "results", "--names", "A,A,B"), "--names has one name for several controllers: A, A, B"),
+    (("record", "results", "--out", "film.avi"), "film.avi must be a folder, or one film that ends in .mp4 or .gif"),
 )  # fmt: skip
+POLAR = """
+import numpy as np
+from servobench.plant.cameras.setups import SensingSetup
+
+def measure(points, optics):
+    x, y, z = np.moveaxis(points[..., 0, 0, :], -1, 0)
+    return np.stack([np.hypot(x + 1.0, y), {arc}, z], axis=-1)
+
+POLAR = SensingSetup("polar", "the ball in polar coordinates", ("radius", "arc", "{last}"), "{unit}", measure)
+"""
+SETUPS = (  # file, its second feature, the name of its third, unit
+    ("still.py", "0.0 * z", "depth", "m"),
+    ("double.py", "1.0 * z", "depth", "m"),
+    ("mm.py", "np.arctan(y / (x + 1.0))", "depth", "mm"),
+    ("named_twice.py", "y", "arc", "m"),
+)
+UNLIKELY = (  # task, its settings, sensing, message
+    ("circle", {"lap_time": 0.5}, "position", "the reference of the task circle moves at 3.7"),
+    ("waypoints", {"file": "fast.csv"}, "position", "the reference of the task waypoints moves at 6 m/s"),
+    ("waypoints", {"file": "slow.csv"}, "position", "slow.csv take 6002 s; time_s is in s, not in ms"),
+    ("target", {"target": [0.0, 0.5, 1.3]}, "position", "a target 160 mm from the arm's shoulder is within the arm"),
+    ("exp2", {}, "./still.py", "--sensing ./still.py: a feature stands still, or moves as another one does"),
+    ("exp2", {}, "./double.py", "--sensing ./double.py: a feature stands still, or moves as another one does"),
+    ("exp2", {}, "./mm.py", "mm/rad; are they in m?"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +297,8 @@ def place(tmp_path_factory) -> Path:
     for name, content in FILES.items():
         (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     (folder / "file").write_text("not a folder")
+    for name, arc, last, unit in SETUPS:
+        (folder / name).write_text(POLAR.format(arc=arc, last=last, unit=unit))
     (folder / "full").mkdir()
     (folder / "full" / "note.txt").write_text("mine")
     comparison(folder / "results")
@@ -246,3 +319,57 @@ def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, 
     assert told.err.count("\n") == 1
     assert words in told.err
     assert files_of(place) == before
+
+
+@pytest.mark.parametrize(("task", "settings", "sensing", "words"), UNLIKELY)
+def test_an_unlikely_input_is_remarked_on_and_runs(place, monkeypatch, caplog, task, settings, sensing, words):
+    monkeypatch.chdir(place)
+    remark.cache_clear()
+    build_once(
+        resolve(RunRequest("kinematic", "constant", task, "none", 0, sensing=sensing), Settings({task: settings}))
+    )
+    assert words in caplog.text
+
+
+@pytest.mark.parametrize("task", ["circle", "line", "lemniscate", "exp2", "target", "random"])
+@pytest.mark.parametrize("sensing", ["position", "pixel", "stereo:hand"])
+def test_a_task_as_it_comes_is_not_remarked_on(caplog, task, sensing):
+    remark.cache_clear()
+    build_once(resolve(RunRequest("kinematic", "constant", task, "severe", 0, sensing=sensing), Settings()))
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("assignment", "extra", "words"),
+    [
+        (
+            "kinematic.sensing.noise_offset=0.05",
+            (),
+            "noise_offset=0.05 has no effect while kinematic.sensing.noise is white",
+        ),
+        ("kinematic.sensing.outlier_size=0.1", (), "has no effect while kinematic.sensing.outliers is 0.0"),
+        ("kinematic.sensing.outlier_size=0.1", ("--mismatch", "outliers=20%"), ""),
+        ("constant.initial.given=[[1.0]]", (), "has no effect while constant.initial.source is nominal"),
+    ],
+)
+def test_a_setting_that_waits_for_another_is_remarked_on(
+    place, monkeypatch, caplog, tmp_path, assignment, extra, words
+):
+    monkeypatch.chdir(place)
+    remark.cache_clear()
+    short = "--set", "exp2.duration=0.1", "--out", str(tmp_path / "out")
+    assert servobench(monkeypatch, "sweep", "--plants", "kinematic", "--controllers", "constant", "--tasks", "exp2",
+                      "--seeds", "1", "--workers", "1", "--set", assignment, *extra, *short) == 0  # fmt: skip
+    assert words in caplog.text if words else not caplog.text
+
+
+def test_a_set_up_whose_features_share_a_name_is_refused_with_its_line(place, monkeypatch, capsys):
+    monkeypatch.chdir(place)
+    assert servobench(monkeypatch, *RUN, "--sensing", "./named_twice.py") == 2
+    assert "named_twice.py:9: ValueError: each joint and feature needs a name of its own" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("evaluate_from", [-1.0, 2.0, 3.0])
+def test_the_judged_part_of_a_task_is_within_its_run(evaluate_from):
+    with pytest.raises(ValueError, match="evaluate_from must be in the run of 2 s, got"):
+        Scenario(None, FixedPoint(np.zeros(3)), 2.0, evaluate_from)

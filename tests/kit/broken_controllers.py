@@ -33,6 +33,7 @@ BROKEN = {  # file, check, begin of its line
     "scalar": (stepping("return servobench.Command(0.0)"), "command", "mine.py:18: ValueError: joint_velocity must have shape (n,)"),
     "too short": (stepping("return servobench.Command(np.zeros(self.n - 1))"), "command", "mine.py:17: step must return a Command of shape (6,), one rad/s a joint, got (5,)"),
     "a column": (stepping("return servobench.Command(np.zeros((self.n, 1)))"), "command", "mine.py:17: step must return a Command of shape (6,), one rad/s a joint, got (6, 1)"),
+    "degrees": (stepping("self.J(np.degrees(observation.joint_position))", STEP.strip()).replace("self.n = knowledge.spec.n", "self.n, self.J = knowledge.spec.n, knowledge.nominal_jacobian"), "command", "mine.py:17: nominal_jacobian is called with 19.3; joint"),
     "huge": (stepping("return servobench.Command(np.full(self.n, 1e9))"), "limits", "mine.py:17: a command is 1e+09 times the joint-speed limit; shorten it"),
     "a little too fast": (stepping("return servobench.Command(np.full(self.n, 1.01))"), "limits", "mine.py:17: a command is 1.01 times the joint-speed limit"),
     "exception in step": (stepping("return observation.joints"), "command", "mine.py:18: AttributeError: 'Observation' object has no attribute 'joints'"),

@@ -13,6 +13,7 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import remark
 from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -136,7 +137,15 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
     topic = "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [0.12, -0.25, 0.002, -0.001, 0.08]\n"
     topic += "k: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
     named = write(f'intrinsics = "ros.yaml"\nrate = 30\n{ON_FLANGE}', "named.toml")
-    for path in (write(CAMERA), write(ROS, "ros.yaml"), tmp_path / "opencv.yml", write(topic, "topic.yaml"), named):
+    flat = write(CAMERA.replace("[[", "[").replace("]]", "]").replace("], [", ", "), "flat.toml")
+    for path in (
+        write(CAMERA),
+        flat,
+        write(ROS, "ros.yaml"),
+        tmp_path / "opencv.yml",
+        write(topic, "topic.yaml"),
+        named,
+    ):
         text = path.read_text()
         camera = read_camera(named if text == ROS else path)
         np.testing.assert_array_equal(camera.matrix, K)
@@ -152,11 +161,15 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
         ("615.0", "0.0036", "a focal length of 0.0036 px does not fit a width of 640 px; in px it is the focal length"),
         ("615.0", "3.6", "a focal length of 3.6 px does not fit"),
         ("322.5", "1200.0", r"the principal point \[1200.0, 238.0\] px must be in the image"),
-        ("matrix = ", "matrices = ", "it has no setting 'matrices': did you mean 'matrix'"),
-        ("0.12", "-3.0", "folds the image before its corners"),
+        ("matrix = ", "matrices = ", "has no setting 'matrices': did you mean 'matrix'"),
+        (
+            "0.12",
+            "-3.0",
+            "folds an image of 640 × 480 px before its corners, with this matrix; take them from one calibration",
+        ),
         ("k3", "k4", "distortion has no coefficient 'k4'; wanted plumb_bob with k1, k2, p1, p2, k3"),
         ("height", 'distortion_model = "fisheye"\nheight', "distortion_model 'fisheye' is not known; wanted plumb_bob"),
-        ("[pose]", "vertical_fov = 60.0\n[pose]", "one of matrix .px. and vertical_fov .deg. must be given"),
+        ("[pose]", "vertical_fov = 60.0\n[pose]", "either matrix .px. or vertical_fov .deg. must be given, got both"),
         ("[pose]", "rate = 0.05\n[pose]", "rate must be given in Hz, from 0.5 to 1000, got 0.05"),
         ("[pose]", "latency = 80\n[pose]", "latency must be given in s, from 0 to 5, got 80"),
         ('frame = "flange"', "", 'a place needs frame, "base" or "flange", and position'),
@@ -180,6 +193,34 @@ def test_a_bad_file_is_one_line(write, old, new, said):
         robot_with(path)
     assert str(caught.value).startswith(f"camera file {path}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "322.5], [0.0, 617.0, 238.0]",
+            "240.0], [0.0, 617.0, 320.0]",
+            "are cx and cy, or width and height, exchanged?",
+        ),
+        ("k1 = 0.12, k2 = -0.25", "k1 = 12.0, k2 = -25.0", "moves points by 144% of their distance from the middle"),
+        (
+            "[0.0, 0.0, 0.70710678, 0.70710678]",
+            "[1.0, 0.0, 0.0, 0.0]",
+            "by more than 60° from the flange's z axis: z is",
+        ),
+        ("[0.0, 0.0, 0.70710678, 0.70710678]", "[0.5, -0.5, 0.5, -0.5]", "a quaternion is x, y, z, w"),
+        ("[pose]", "target.radius = 40\n[pose]", "target.radius is 40, and usually at most 0.5 m; if 40mm is meant"),
+        (ON_FLANGE, ABOVE.replace("1.9]", "15.5]"), "pose.position is 15.5, and usually at most 5 m"),
+    ],
+)
+def test_an_unlikely_file_is_remarked_on(write, caplog, old, new, said):
+    remark.cache_clear()
+    read_camera(write(CAMERA + ON_FLANGE))
+    assert not caplog.text
+    assert old in CAMERA + ON_FLANGE
+    read_camera(write((CAMERA + ON_FLANGE).replace(old, new)))
+    assert said in caplog.text
 
 
 def test_a_camera_that_does_not_fit_the_set_up_is_refused_with_the_remedy(write):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.fmu.mapping import JointLimits, LogNames, TruthMapping, read_mapping
+from servobench.plant.contract.settings import remark
+from servobench.plant.fmu.description import FmuDescription, Variable
+from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping, mapping_spec, read_mapping
 
 WHOLE = """
 file = "crane.fmu"
@@ -85,3 +87,26 @@ def test_a_bad_mapping_is_one_clear_error_that_names_the_file(tmp_path, old, new
 def test_a_missing_mapping_is_told(tmp_path):
     with pytest.raises(ValueError, match=r"mapping .*missing.toml cannot be read"):
         read_mapping(tmp_path / "missing.toml")
+
+
+@pytest.mark.parametrize(("told", "given", "fits"), [("m", "mm", False), ("mm", "m", False), ("m", "m", True),
+                                                     ("1", "px", True), ("", "mm", True)])  # fmt: skip
+def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
+    variables = Variable("v", 0, 1, "input"), Variable("y", 1, 1, "output", unit=told)
+    described = FmuDescription(tmp_path / "a.fmu", 2, "a", "a", "", False, False, False, variables)
+    mapping = FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), names=LogNames(feature_unit=given))
+    if fits:
+        assert mapping_spec(mapping, described, 0.05).feature_unit == given
+        return
+    with pytest.raises(ValueError, match=f"names.feature_unit must be {told}, the unit of y, got {given}"):
+        mapping_spec(mapping, described, 0.05)
+
+
+def test_features_that_are_the_joints_are_remarked_on(tmp_path, caplog):
+    remark.cache_clear()
+    variables = Variable("v", 0, 1, "input"), Variable("q", 1, 1, "output"), Variable("y", 2, 1, "output")
+    described = FmuDescription(tmp_path / "a.fmu", 2, "a", "a", "", False, False, False, variables)
+    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
+    assert not caplog.text
+    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("q",), joints=("q",)), described, 0.05)
+    assert "features of the mapping are its joints, q;" in caplog.text

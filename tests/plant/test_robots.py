@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
+from servobench.plant.contract.settings import remark
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
@@ -17,6 +19,8 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import at_far_end, estimate_links
 from servobench.plant.robot.workspace import find_workspace, segment_distance
 
+INERTIAL = '<inertial><mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+HEAVY = re.sub(r'<link name="(\w+)"/>', rf'<link name="\1">{INERTIAL}</link>', odd_urdf())
 RNG = np.random.default_rng(7)
 
 
@@ -209,6 +213,65 @@ def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
     path.write_text(FOUR_JOINTS.replace(before, after))
     with pytest.raises(ValueError, match=f"robot file .*arm.toml.*{message}"):
         find_robot(str(path))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('convention = "standard"\n', "", 'is read by the standard convention; write convention = "standard" or'),
+        ("\nd = [", "\nmass = [3700, 1, 1, 1]\nd = [", "mass is 3700, and usually at most 500 kg; if 3700g is meant"),
+        ("\nd = [", "\ntorque = [15e4, 1, 1, 1]\nd = [", "torque is 150000, and usually at most 20000 Nm"),
+        ("joint_speed = [2.0", "joint_speed = [0.003", "joint_speed is 0.003, and usually at least 0.01 rad/s"),
+    ],
+)
+def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog, before, after, message):
+    remark.cache_clear()
+    (tmp_path / "arm.toml").write_text(FOUR_JOINTS)
+    find_robot(str(tmp_path / "arm.toml"))
+    assert not caplog.text
+    assert before in FOUR_JOINTS
+    (tmp_path / "other.toml").write_text(FOUR_JOINTS.replace(before, after))
+    find_robot(str(tmp_path / "other.toml"))
+    assert message in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (' velocity="2"', "", "limits that the URDF lacks are taken as ±2π rad and π rad/s: velocity of joint_1,"),
+        (
+            'lower="-2.5" ',
+            "",
+            "limits that the URDF lacks are taken as ±2π rad and π rad/s: range of joint_1, range of",
+        ),
+        ('rpy="0.1', 'rpy="90', "has an rpy of 90, and angles of a URDF are in rad"),
+        ('<mass value="2', '<mass value="2000', "link 'link_1': mass is 2000, and usually at most 500 kg; if 2000g"),
+    ],
+)
+def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog, before, after, message):
+    pytest.importorskip("yourdfpy")
+    remark.cache_clear()
+    assert before in HEAVY
+    (tmp_path / "arm.urdf").write_text(HEAVY)
+    find_robot(str(tmp_path / "arm.urdf"))
+    assert not caplog.text
+    (tmp_path / "other.urdf").write_text(HEAVY.replace(before, after))
+    find_robot(str(tmp_path / "other.urdf"))
+    assert message in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>', "joint 'joint_2' turns about the axis 0 0 0; the usual one"),
+        ('<mass value="2', '<mass value="-2', "link 'link_1': mass must be above 0, got -2.0"),
+    ],
+)
+def test_a_urdf_of_no_arm_is_refused(tmp_path, before, after, message):
+    pytest.importorskip("yourdfpy")
+    (tmp_path / "arm.urdf").write_text(HEAVY.replace(before, after))
+    with pytest.raises(ValueError, match=rf"robot file .*arm.urdf: {message}"):
+        find_robot(str(tmp_path / "arm.urdf"))
 
 
 def test_an_unknown_robot_is_told_the_nearest():

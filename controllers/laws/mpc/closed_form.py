@@ -201,16 +201,11 @@ class Blocks:
     the sums over the blocks are approximations, so that the optimum in continuous time stays the same:
 
         Σ ‖error‖² + q Σ ‖step‖²  ≈  (1/Δ) ∫ ‖error‖² dt + q Δ ∫ ‖velocity‖² dt   with q = q₀ (Δ₀ / Δ)²
-
-    Attributes:
-        count: B.
-        length: Δ [s].
-        period: of control [s].
     """
 
-    count: int
-    length: float
-    period: float
+    count: int  # B
+    length: float  # Δ [s]
+    period: float  # of control [s]
 
     @classmethod
     def of(cls, horizon_time: float, moves: int, period: float) -> Blocks:

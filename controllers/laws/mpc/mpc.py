@@ -7,16 +7,7 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law, Stage
-from servobench.controllers.laws.mpc.closed_form import (
-    Blocks,
-    UnlimitedPlan,
-    bridging_shares,
-    decay_shares,
-    decay_targets,
-    horizon_integrals,
-    move_weights,
-    preview_weights,
-)
+from servobench.controllers.laws.mpc import closed_form
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver, exceeds, joint_bounds, view_rows
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.limit import scale_to_limit
@@ -71,41 +62,24 @@ class MpcConfig:
 
 
 class Plan(NamedTuple):
-    """The moves of the last command and the result of the solver.
+    """The moves of the last command and the result of the solver."""
 
-    Attributes:
-        moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
-        success: (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before the first command.
-        iterations: (...), of the solver; 0 without an active limit.
-        active_limits: (...), NaN without a solution.
-    """
-
-    moves: FloatArray
-    success: FloatArray
-    iterations: FloatArray
-    active_limits: FloatArray
+    moves: FloatArray  # dq_1 … dq_H, or the one constant step, (..., moves, n), rad
+    success: FloatArray  # (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before a command
+    iterations: FloatArray  # (...), of the solver; 0 without an active limit
+    active_limits: FloatArray  # (...), NaN without a solution
 
 
 class MpcState(NamedTuple):
-    """The state of the predictive law.
+    """The state of the predictive law."""
 
-    Attributes:
-        sent: (..., D, n), rad, the steps sent in the last `delay` seconds, the newest one last.
-        last: (..., n), rad, the last step sent.
-        fallbacks: (...), commands without a solution so far.
-        J: (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two.
-        targets: (..., moves, m), of the last command.
-        final: (..., m), m, error at the end of the horizon if the arm stood still.
-        plan: of the last command.
-    """
-
-    sent: FloatArray
-    last: FloatArray
-    fallbacks: FloatArray
-    J: FloatArray
-    targets: FloatArray
-    final: FloatArray
-    plan: Plan
+    sent: FloatArray  # (..., D, n), rad, the steps sent in the last `delay` seconds, the newest one last
+    last: FloatArray  # (..., n), rad, the last step sent
+    fallbacks: FloatArray  # (...), commands without a solution so far
+    J: FloatArray  # (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two
+    targets: FloatArray  # (..., moves, m), of the last command
+    final: FloatArray  # (..., m), m, error at the end of the horizon if the arm stood still
+    plan: Plan  # of the last command
 
 
 @final
@@ -148,7 +122,7 @@ class MpcLaw(Law[MpcState]):
             ValueError: the preview does not reach the horizon, or a setting does not fit the sizes.
         """
         spec = knowledge.spec
-        blocks = Blocks.of(config.horizon_time, config.moves, spec.period)
+        blocks = closed_form.Blocks.of(config.horizon_time, config.moves, spec.period)
         if config.use_preview:
             reach = blocks.count * blocks.length + config.delay
             check_preview(reach, knowledge.preview, spec.period, "horizon_time + delay")
@@ -157,17 +131,18 @@ class MpcLaw(Law[MpcState]):
         self._config, self._spec, self._blocks = config, spec, blocks
         own: dict[Stage, bool] = {"limit": True, "preview": config.use_preview, "predict": config.delay > 0.0}
         self.owns = frozenset(stage for stage, brought in own.items() if brought)
-        self._places, self._to_come = blocks.places(config.delay), bridging_shares(config.delay, spec.period)[:, None]
+        self._places = blocks.places(config.delay)
+        self._to_come = closed_form.bridging_shares(config.delay, spec.period)[:, None]
         constant, horizon = config.mode == "constant", blocks.count
         weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
         # One constant velocity is weighted once, not in every block.
         self._Q: FloatArray = config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
         self._terminal = config.terminal_weight / blocks.relative_length
         rho, alpha = config.decay * blocks.length, math.exp(-config.forgetting * blocks.length)
-        self._shares = decay_shares(horizon, rho)
-        self._integrals = horizon_integrals(horizon, alpha, rho)
-        self._preview_weights = preview_weights(horizon, alpha)
-        weights = move_weights(horizon, alpha, self._terminal)
+        self._shares = closed_form.decay_shares(horizon, rho)
+        self._integrals = closed_form.horizon_integrals(horizon, alpha, rho)
+        self._preview_weights = closed_form.preview_weights(horizon, alpha)
+        weights = closed_form.move_weights(horizon, alpha, self._terminal)
         gain = self._integrals.a + self._terminal * horizon**2
         self._change: FloatArray = np.full(spec.n, config.joint_acceleration_limit * blocks.length)
         self._shape = QpShape(
@@ -180,9 +155,9 @@ class MpcLaw(Law[MpcState]):
             view_rows=view_rows(config.view_tangent, spec.m),
         )
         self._unlimited = (
-            UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
+            closed_form.UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
             if constant
-            else UnlimitedPlan.of_free_moves(weights, self._Q)
+            else closed_form.UnlimitedPlan.of_free_moves(weights, self._Q)
         )
         self._program = QpProgram(self._shape, config.solver)
 
@@ -269,7 +244,7 @@ class MpcLaw(Law[MpcState]):
 
     def _program_targets(self, error: FloatArray, ahead: FloatArray) -> FloatArray:
         """Return the targets of the program, (..., H, m) m, or integrated over the horizon, (..., 1, m)."""
-        targets = decay_targets(error, ahead, self._shares)
+        targets = closed_form.decay_targets(error, ahead, self._shares)
         if self._config.mode == "moves":
             return targets
         integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(self._preview_weights, ahead)

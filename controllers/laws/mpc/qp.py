@@ -105,21 +105,13 @@ class QpShape:
 
 
 class QpBounds(NamedTuple):
-    """The bounds that change from period to period; many runs side by side have leading axes.
+    """The bounds that change from period to period; many runs side by side have leading axes."""
 
-    Attributes:
-        first_lower: (..., n), rad, of the first move.
-        first_upper: (..., n), rad.
-        travel_lower: (..., n), rad, of S_t.
-        travel_upper: (..., n), rad.
-        view_margin: (..., v), smallest V J S_t.
-    """
-
-    first_lower: FloatArray
-    first_upper: FloatArray
-    travel_lower: FloatArray
-    travel_upper: FloatArray
-    view_margin: FloatArray
+    first_lower: FloatArray  # (..., n), rad, of the first move
+    first_upper: FloatArray  # (..., n), rad
+    travel_lower: FloatArray  # (..., n), rad, of S_t
+    travel_upper: FloatArray  # (..., n), rad
+    view_margin: FloatArray  # (..., v), smallest V J S_t
 
 
 @dataclass(frozen=True, eq=False)

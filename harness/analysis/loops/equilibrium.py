@@ -112,19 +112,12 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """An arm at rest.
+    """An arm at rest."""
 
-    Attributes:
-        joint_position: (n,) [rad].
-        feature: (m,), the measured and the desired one.
-        time: of the next step [s].
-        preview: future rows of the reference.
-    """
-
-    joint_position: FloatArray
-    feature: FloatArray
-    time: float
-    preview: int
+    joint_position: FloatArray  # (n,) [rad]
+    feature: FloatArray  # (m,), the measured and the desired one
+    time: float  # of the next step [s]
+    preview: int  # future rows of the reference
 
     def observation(self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0) -> Observation:
         """Return the observation of other values, (..., m) and (..., n), `after` [s] later."""
@@ -246,23 +239,14 @@ class Packing:
 
 @dataclass(frozen=True, eq=False)
 class Warm:
-    """A controller after its warm-up.
+    """A controller after its warm-up."""
 
-    Attributes:
-        controller: in the state that the move left.
-        model: the true robot.
-        nominal: the robot by its maker's description.
-        rest: the place where it is now, as if the feature were wanted there.
-        arm: linear model of arm and camera there.
-        plant: settings of the plant.
-    """
-
-    controller: Controller
-    model: HandEyeModel
-    nominal: HandEyeModel
-    rest: Rest
-    arm: ArmModel
-    plant: KinematicConfig
+    controller: Controller  # in the state that the move left
+    model: HandEyeModel  # the true robot
+    nominal: HandEyeModel  # the robot by its maker's description
+    rest: Rest  # the place where it is now, as if the feature were wanted there
+    arm: ArmModel  # linear model of arm and camera there
+    plant: KinematicConfig  # settings of the plant
 
 
 def warm_up(resolved: ResolvedRun) -> Warm:

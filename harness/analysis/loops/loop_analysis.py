@@ -75,15 +75,10 @@ LEGEND = (
 
 
 class Record(NamedTuple):
-    """The logged signals of one experiment.
+    """The logged signals of one experiment."""
 
-    Attributes:
-        measured: features and joint positions as the controller saw them, as deviations, (periods, m + n).
-        command: (periods, n) [rad/s].
-    """
-
-    measured: FloatArray
-    command: FloatArray
+    measured: FloatArray  # features and joint positions as the controller saw them, as deviations, (periods, m + n)
+    command: FloatArray  # (periods, n) [rad/s]
 
 
 @final
@@ -222,23 +217,14 @@ def controller_response(records: list[Record], period: float) -> tuple[FloatArra
 
 @dataclass(frozen=True, eq=False)
 class LoopAnalysis:
-    """The loop around a rest.
+    """The loop around a rest."""
 
-    Attributes:
-        name: of the controller.
-        model: "linearised" or "identified".
-        stable: whether the loop is stable as it is.
-        margins: of the loop.
-        response: the frequency response of controller and loop.
-        step: each feature after a unit step of its own reference, (periods, m).
-    """
-
-    name: str
-    model: str
-    stable: bool
-    margins: Margins
-    response: LoopResponse
-    step: FloatArray
+    name: str  # of the controller
+    model: str  # "linearised" or "identified"
+    stable: bool  # whether the loop is stable as it is
+    margins: Margins  # of the loop
+    response: LoopResponse  # the frequency response of controller and loop
+    step: FloatArray  # each feature after a unit step of its own reference, (periods, m)
 
     @property
     def arm(self) -> ArmModel:

@@ -42,19 +42,12 @@ WHOLE = 1e-9  # [1] a share of a period below which a delay is a whole number of
 
 
 class StateSpace(NamedTuple):
-    """A discrete linear system.
+    """A discrete linear system."""
 
-    Attributes:
-        A: (s, s).
-        B: (s, inputs).
-        C: (outputs, s).
-        D: (outputs, inputs).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    A: FloatArray  # (s, s)
+    B: FloatArray  # (s, inputs)
+    C: FloatArray  # (outputs, s)
+    D: FloatArray  # (outputs, inputs)
 
     def response(self, z: ComplexArray) -> ComplexArray:
         """Return C (zI − A)⁻¹ B + D, (k, outputs, inputs), at the points z, (k,), of the complex plane."""
@@ -110,21 +103,13 @@ def is_stable(A: FloatArray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Arm and camera around a rest.
+    """Arm and camera around a rest."""
 
-    Attributes:
-        jacobian: J, (m, n), unit of the feature per rad.
-        period: dt [s].
-        lag: τ [s]; 0 for joints that have the commanded velocity at once.
-        command_delay: D [s].
-        latency: ℓ [s].
-    """
-
-    jacobian: FloatArray
-    period: float
-    lag: float
-    command_delay: float
-    latency: float
+    jacobian: FloatArray  # J, (m, n), unit of the feature per rad
+    period: float  # dt [s]
+    lag: float  # τ [s]; 0 for joints that have the commanded velocity at once
+    command_delay: float  # D [s]
+    latency: float  # ℓ [s]
 
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
@@ -190,27 +175,16 @@ def split(delay: float, period: float) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class Margins:
-    """The margins of a loop.
+    """The margins of a loop."""
 
-    Attributes:
-        gain: the factor on the command above 1 at which the loop becomes unstable; inf if there is none.
-        gain_reduction: the factor below 1 at which it becomes unstable; 0 if there is none.
-        phase: [rad], of all features together; inf where no locus crosses the unit circle.
-        delay: additional latency of the camera at which the loop becomes unstable [s]; inf if there is none.
-        crossover: largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none does.
-        sensitivity_peak: M_s, at the feature [1].
-        complementary_peak: max σ̄(T), at the feature [1].
-        disk: α, at the feature [1].
-    """
-
-    gain: float
-    gain_reduction: float
-    phase: float
-    delay: float
-    crossover: float
-    sensitivity_peak: float
-    complementary_peak: float
-    disk: float
+    gain: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
+    gain_reduction: float  # the factor below 1 at which it becomes unstable; 0 if there is none
+    phase: float  # [rad], of all features together; inf where no locus crosses the unit circle
+    delay: float  # additional latency of the camera at which the loop becomes unstable [s]; inf if there is none
+    crossover: float  # largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none
+    sensitivity_peak: float  # M_s, at the feature [1]
+    complementary_peak: float  # max σ̄(T), at the feature [1]
+    disk: float  # α, at the feature [1]
 
 
 def frequencies(period: float, points: int = POINTS) -> FloatArray:
@@ -221,17 +195,11 @@ def frequencies(period: float, points: int = POINTS) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LoopResponse:
-    """The frequency response of a controller on an arm, and of the loops that they make.
+    """The frequency response of a controller on an arm, and of the loops that they make."""
 
-    Attributes:
-        frequency: ω, (k,) [rad/s], ascending.
-        controller: from the measured feature and joint positions to the command, (k, n, m + n) [rad/s].
-        arm: linear model of arm and camera.
-    """
-
-    frequency: FloatArray
-    controller: ComplexArray
-    arm: ArmModel
+    frequency: FloatArray  # ω, (k,) [rad/s], ascending
+    controller: ComplexArray  # from the measured feature and joint positions to the command, (k, n, m + n) [rad/s]
+    arm: ArmModel  # linear model of arm and camera
 
     @property
     def z(self) -> ComplexArray:

@@ -23,7 +23,7 @@ from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
 from servobench.harness.studies.tuning.spaces import find_tunable
-from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 
 SECOND: Final = ".second"  # of the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
@@ -54,13 +54,12 @@ class Ledger:
             self._read()
 
     def _read(self) -> None:
-        try:
+        wrong = OSError, KeyError, TypeError, OverflowError, RecursionError
+        with configuration_errors(f"study {self.path} cannot be opened: ", *wrong):
             content = self.path.read_bytes()
             self._size = content.rfind(b"\n") + 1
             header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            raise ConfigurationError(f"study {self.path} cannot be opened: {error}") from error
         parts = [key for key in self._fingerprint if not isinstance(header, dict)
                  or header.get(key) != self._fingerprint[key]]  # fmt: skip
         if parts:
