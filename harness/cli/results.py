@@ -210,14 +210,16 @@ def say_aids(folder: Path) -> None:
         say(line)
 
 
-def print_faults(runs: pd.DataFrame) -> None:
-    """Print which controllers command too much, and why runs failed, a line each; of many the first ones."""
+def print_faults(folder: Path, runs: pd.DataFrame) -> None:
+    """Print which controllers of the user's command too much, and why runs failed, a line each; the first of many."""
+    from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
     from servobench.plant.contract.settings import remark
 
+    own = results.read_manifest(folder).get("own_controllers", {})
     saturation = runs.reindex(columns=["controller", "saturation_fraction"])
     for name, share in saturation.groupby("controller").median().itertuples():
-        if share > MAX_SATURATED:
+        if share > MAX_SATURATED and name in own:
             remark(f"{name} commands more than a joint's limit in {share:.0%} of its periods; commands are in rad/s")
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")

@@ -186,7 +186,7 @@ def _show(folder: Path, *, latest: bool, with_figures: bool, with_report: bool) 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
     say_aids(folder)
-    print_faults(runs)
+    print_faults(folder, runs)
     if latest:
         point_latest(folder)
     say(f"tables and {_draw(folder)} figures in {folder}" if with_figures else f"tables in {folder}")
