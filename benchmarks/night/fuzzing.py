@@ -28,6 +28,7 @@ from types import FrameType
 import numpy as np
 
 from night.parsers import PARSERS, Parser
+from servobench.plant.contract.faults import ConfigurationError
 
 MAX_SECONDS = 5.0  # [s] of the processor that a parser may take
 MAX_BYTES = 500_000_000  # [bytes] that a parser may ask for
@@ -122,7 +123,7 @@ def check(parser: Parser, given: str | bytes, folder: Path) -> bool:
         with limited():
             parser.read(given, folder)
     except ValueError as error:
-        if type(error) is not parser.error:
+        if type(error) not in (parser.error, ConfigurationError):
             raise Broken(f"{type(error).__name__}: {error}") from error
         text = str(error)
         if not text.strip() or len(text.splitlines()) > 1:

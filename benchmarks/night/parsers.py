@@ -49,6 +49,7 @@ from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping
+from servobench.plant.robot import catalogue
 from servobench.plant.robot.hand_eye import FEATURE
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
@@ -102,7 +103,7 @@ def _mapping(text: str, folder: Path) -> None:
 
 def _robot(ending: str) -> Callable[[str, Path], object]:
     def read(text: str, folder: Path) -> None:
-        _forget(find_robot.__globals__["catalogue"]._read)
+        _forget(catalogue._read)
         find_robot(str(_written(folder / f"robot{ending}", text)))
 
     return read

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib.metadata
 import keyword
 import re
 import sys
@@ -50,7 +50,7 @@ def new(
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
-    if importlib.util.find_spec(module) is not None:
+    if module in sys.stdlib_module_names or module in importlib.metadata.packages_distributions():
         raise ConfigurationError(
             f"a Python package is called {module}, which a file of this name would hide; take another"
         )
