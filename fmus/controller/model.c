@@ -40,15 +40,11 @@ void model_accept(Model *model) { (void)model; }
 
 ModelStatus model_check(const Model *model)
 {
-    (void)model;
     return MODEL_OK;
 }
 
 ModelStatus model_admits(size_t index, int starting, int exchanging)
 {
-    (void)index;
-    (void)starting;
-    (void)exchanging;
     return MODEL_OK;
 }
 
@@ -152,28 +148,20 @@ ModelStatus model_step(Model *model, double step)
 
 ModelStatus model_settle(Model *model, int *changed)
 {
-    (void)model;
     *changed = 0;
     return MODEL_OK;
 }
 
 int model_next_event(Model *model, char text[MESSAGE_SIZE])
 {
-    (void)model;
-    (void)text;
     return 0;
 }
 
 void model_set_states(Model *model, const double *states)
 {
-    (void)model;
-    (void)states;
 }
 
 ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
 {
-    (void)model;
-    (void)direction;
-    (void)starting;
     return MODEL_NO_DERIVATIVES;
 }

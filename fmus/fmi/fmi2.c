@@ -37,8 +37,6 @@ const char *fmi2GetVersion(void) { return fmi2Version; }
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *callbacks, fmi2Boolean visible, fmi2Boolean logging)
 {
-    (void)resources;
-    (void)visible;
     if (callbacks == NULL || name == NULL || guid == NULL) return NULL;
     Instance *instance = calloc(1, sizeof *instance);
     const size_t size = strlen(name) + 1;
@@ -76,8 +74,6 @@ void fmi2FreeInstance(fmi2Component instance)
 fmi2Status fmi2SetupExperiment(fmi2Component instance, fmi2Boolean tolerance_defined, fmi2Real tolerance,
                                fmi2Real start, fmi2Boolean stop_defined, fmi2Real stop)
 {
-    (void)tolerance_defined;
-    (void)tolerance;
     OPEN(INSTANTIATED);
     return ANSWER(core_begin(&self->core, start, stop_defined, stop));
 }
@@ -116,8 +112,6 @@ fmi2Status fmi2SetReal(fmi2Component instance, const fmi2ValueReference referenc
 #define NO_VARIABLES(name, type)                                                                                 \
     fmi2Status name(fmi2Component instance, const fmi2ValueReference references[], size_t count, type values[]) \
     {                                                                                                            \
-        (void)references;                                                                                        \
-        (void)values;                                                                                            \
         OPEN(~0);                                                                                                \
         return ANSWER(count == 0 ? NULL : "the model has real variables only");                                  \
     }
@@ -153,9 +147,6 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component instance, const fmi2ValueR
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component instance, const fmi2ValueReference references[], size_t count,
                                        const fmi2Integer orders[], const fmi2Real values[])
 {
-    (void)references;
-    (void)orders;
-    (void)values;
     OPEN(~0);
     return ANSWER(count == 0 ? NULL : "inputs are held, not interpolated");
 }
@@ -163,16 +154,12 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component instance, const fmi2ValueRe
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component instance, const fmi2ValueReference references[], size_t count,
                                         const fmi2Integer orders[], fmi2Real values[])
 {
-    (void)references;
-    (void)orders;
-    (void)values;
     OPEN(~0);
     return ANSWER(count == 0 ? NULL : "not provided");
 }
 
 fmi2Status fmi2DoStep(fmi2Component instance, fmi2Real time, fmi2Real step, fmi2Boolean no_set_state)
 {
-    (void)no_set_state;
     OPEN(STEPPING);
     const char *message = core_step(&self->core, time, step);
     report_events(self);
@@ -188,8 +175,6 @@ fmi2Status fmi2CancelStep(fmi2Component instance)
 #define NO_STATUS(name, type, message)                                                       \
     fmi2Status name(fmi2Component instance, const fmi2StatusKind kind, type *value)          \
     {                                                                                        \
-        (void)kind;                                                                          \
-        (void)value;                                                                         \
         OPEN(~0);                                                                            \
         return report(self, fmi2Discard, __func__, message);                                 \
     }

@@ -67,14 +67,6 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
                                          fmi3IntermediateUpdateCallback update)
 {
-    (void)name;
-    (void)resources;
-    (void)visible;
-    (void)event_mode;
-    (void)early_return;
-    (void)intermediate;
-    (void)n_intermediate;
-    (void)update;
     return instantiate("fmi3InstantiateCoSimulation", token, 0, logging, environment, log);
 }
 
@@ -82,9 +74,6 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
                                           fmi3Boolean logging, fmi3InstanceEnvironment environment,
                                           fmi3LogMessageCallback log)
 {
-    (void)name;
-    (void)resources;
-    (void)visible;
     return instantiate("fmi3InstantiateModelExchange", token, 1, logging, environment, log);
 }
 
@@ -93,8 +82,6 @@ void fmi3FreeInstance(fmi3Instance instance) { free(instance); }
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolerance_defined, fmi3Float64 tolerance,
                                        fmi3Float64 start, fmi3Boolean stop_defined, fmi3Float64 stop)
 {
-    (void)tolerance_defined;
-    (void)tolerance;
     OPEN(INSTANTIATED);
     const char *message = core_begin(&self->core, start, stop_defined, stop);
     if (message == NULL) {
@@ -154,7 +141,6 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
                       fmi3Boolean *event_needed, fmi3Boolean *terminate, fmi3Boolean *early_return,
                       fmi3Float64 *last_time)
 {
-    (void)no_set_state;
     OPEN(STEPPING);
     *event_needed = *terminate = *early_return = false;
     const char *message = core_step(&self->core, time, step);

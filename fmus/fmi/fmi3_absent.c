@@ -1,7 +1,4 @@
 /* Functions that FMI 3.0 requires of every library and this model does not have: other types, clocks, interfaces. */
-#ifdef __GNUC__
-#pragma GCC diagnostic ignored "-Wunused-parameter" /* absent functions use none of them */
-#endif
 #include "fmi3_instance.h"
 
 /* In any phase: the model has nothing of the kind. */

@@ -2,6 +2,10 @@
 #ifndef MODEL_FUNCTIONS_H
 #define MODEL_FUNCTIONS_H
 
+#ifdef __GNUC__ /* The standard prescribes parameters that a model need not use. */
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+
 /* The message of a status; NULL for MODEL_OK. */
 const char *model_explain(ModelStatus status);
 

@@ -63,7 +63,6 @@ Status FMI_STATE(Free, )(Handle instance, State *state)
 
 Status FMI_STATE(Serialized, Size)(Handle instance, State state, size_t *size)
 {
-    (void)state;
     OPEN(~0);
     *size = sizeof(Snapshot);
     return STATUS_OK;
@@ -106,7 +105,6 @@ Status FMI(EnterContinuousTimeMode)(Handle instance)
 
 Status FMI(CompletedIntegratorStep)(Handle instance, Boolean no_set_state, Boolean *enter_event, Boolean *terminate)
 {
-    (void)no_set_state;
     OPEN(CONTINUOUS);
     *enter_event = *terminate = 0;
     model_accept(&self->core.model);
