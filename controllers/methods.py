@@ -1,26 +1,99 @@
-"""The methods by name, one row each: a control law, an estimator and the defaults that differ from those of the parts.
+"""Estimators, control laws and the methods made of them by name, one row each; and a controller of one's own with aids.
 
-A plain name is the method with all aids that help it; `NAME:published` has none and its law as printed. Any other pair
-is a method too, called `law+estimator`. Method numbers and equations in the summaries are the paper's.
+A new part works with every part of the other kind. A method is a control law, an estimator and the defaults that differ
+from those of the parts. A plain name is the method with all aids that help it; `NAME:published` has none and its law as
+printed. Any other pair is a method too, called `law+estimator`. Method numbers and equations in the summaries are the
+paper's.
+
+A controller of your own with the aids of the others is the law of a composed controller.
+
+    Observation → pair → estimate → predict → own controller → feedforward, posture, limit → Command
+
+The regression on the nominal Jacobian stands in the estimator's place. The controller gets, in the unit of the plant:
+
+    observation                  joint position q̂ and feature that the arm reaches once all delays have passed
+    reference                    the same time later; with feedforward row 0 alone, as that adds the reference's motion
+    knowledge.nominal_jacobian   J(q) = J_n(q) + Ĵ(q̂) − J_n(q̂); J_n(q) before the first step, as in the constructor
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import Any, Final, Self, TypeVar
+from functools import cache, partial
+from typing import Any, Final, Generic, Self, TypeVar, final
+
+import numpy as np
 
 from servobench.controllers.aids import EQUIPPED, AidsConfig
-from servobench.controllers.controller import ControllerEntry, RobotKnowledge
+from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
+from servobench.controllers.estimators import correntropy
+from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
+from servobench.controllers.estimators.projection import BroydenConfig, CfdlConfig, ProjectionEstimator
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
+from servobench.controllers.estimators.robust_filter import RobustConfig, RobustEstimator
+from servobench.controllers.estimators.ukf import UkfConfig, ukf_estimator
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
+from servobench.controllers.laws.law import Estimate, Law
+from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.laws.pid import PidConfig, PidLaw
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.config import ControllerTraining, TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
-from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
 from servobench.controllers.units import in_natural_units
-from servobench.plant.contract.settings import did_you_mean
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import did_you_mean, override
+from servobench.plant.contract.signals import Command, Observation
 
 Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class Part(Generic[Kind]):
+    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it.
+
+    Attributes:
+        config: its settings, a frozen dataclass with a default for every field.
+        make: its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`.
+        needs_truth: whether it needs the true Jacobian.
+        trained: whether it starts from networks that are trained offline.
+    """
+
+    config: type[Any]
+    make: Callable[..., Kind]
+    needs_truth: bool = False
+    trained: bool = False
+
+
+ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
+    "constant": Part(ConstantConfig, ConstantEstimator),
+    "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
+    "ukf": Part(UkfConfig, ukf_estimator),
+    "kalman": Part(KalmanConfig, kalman_estimator),
+    "mckf": Part(correntropy.MckfConfig, correntropy.mckf_estimator),
+    "imcckf": Part(correntropy.ImcckfConfig, correntropy.imcckf_estimator),
+    "gmckf": Part(correntropy.GmckfConfig, correntropy.gmckf_estimator),
+    "rmckf": Part(correntropy.RmckfConfig, correntropy.rmckf_estimator),
+    "robust": Part(RobustConfig, RobustEstimator),
+    "broyden": Part(BroydenConfig, ProjectionEstimator),
+    "rls": Part(RlsConfig, RlsEstimator),
+    "rbf": Part(RbfConfig, RbfEstimator, trained=True),
+    "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
+    "cfdl": Part(CfdlConfig, ProjectionEstimator),
+}
+
+LAWS: dict[str, Part[Law[Any]]] = {
+    "pid": Part(PidConfig, PidLaw),
+    "mfac": Part(MfacConfig, MfacLaw),
+    "mpc": Part(MpcConfig, MpcLaw),
+    "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
+}
+
+
 PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
 
 
@@ -205,3 +278,85 @@ def suggest_pair(name: str) -> str:
     methods = [method for method in METHODS if name in re.split("[_:]", method)]
     ready = f"; methods with it: {', '.join(methods)}" if methods else ""
     return f"it is {'a law' if is_law else 'an estimator'} and makes a pair, such as {pair}{ready}"
+
+
+@final
+class OwnLaw(Law[None]):
+    """A controller `own` as the law of one run; it keeps its state itself. `seed` is for its next reset."""
+
+    def __init__(self, make: Callable[[RobotKnowledge], Controller], given: RobotKnowledge, aids: AidsConfig) -> None:
+        """Make the controller with its knowledge of a robot, in the unit of the plant."""
+        self._nominal, self._unit, self.seed = given.nominal_jacobian, given.spec.feature.scale, 0
+        self._correction: FloatArray | float = 0.0
+        self._rows = 1 if aids.feedforward else 1 + given.preview
+        self._corrects = self._nominal is not None and aids.model != "own"
+        model = self._jacobian if self._corrects else self._nominal
+        self.own = make(replace(given, nominal_jacobian=model, preview=self._rows - 1))
+        self.owns = frozenset() if aids.feedforward else frozenset({"preview"})
+        self.in_model_frame = self.own.in_model_frame
+
+    def start(self, observation: Observation) -> None:
+        """Reset the controller."""
+        self._correction = 0.0
+        self.own.reset(self._in_plant_unit(observation), self.seed)
+
+    def command(
+        self, state: None, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[None, FloatArray]:
+        """Return the joint velocity of the controller, (n,) rad/s."""
+        if self._nominal is not None and self._corrects:
+            self._correction = self._unit * estimate.jacobian - self._nominal(observation.joint_position)
+        wanted = self._unit * reference[: self._rows]
+        return state, self.own.step(self._in_plant_unit(observation), wanted).joint_velocity
+
+    def diagnostics(self, state: None) -> Diagnostics:
+        """Return those of the controller."""
+        return self.own.diagnostics()
+
+    def _jacobian(self, joint_position: FloatArray) -> FloatArray:
+        nominal: Any = self._nominal
+        return np.asarray(nominal(joint_position) + self._correction)
+
+    def _in_plant_unit(self, observation: Observation) -> Observation:
+        return observation.with_values(observation.joint_position, self._unit * observation.feature)
+
+
+@final
+class AidedController(Controller):
+    """A controller of your own, `law.own`, in the chain of a composed one."""
+
+    def __init__(self, make: Callable[..., Controller], config: MethodConfig, knowledge: RobotKnowledge) -> None:
+        """Make the controller, `make(config.law, knowledge)`, and compose the chain around it."""
+        self.law, natural = OwnLaw(partial(make, config.law), knowledge, config.aids), in_natural_units(knowledge)
+        initial = initial_jacobian(config.initial, natural)
+        self._chain = ServoController(Servo(ConstantEstimator(), self.law, initial, natural, config.aids))
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """See `Controller.reset`."""
+        self.law.seed = seed
+        self._chain.reset(observation, seed)
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`."""
+        return self._chain.step(observation, reference)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return those of the chain and of the controller."""
+        return self._chain.diagnostics()
+
+    def estimated_jacobian(self) -> FloatArray | None:
+        """Return the estimate of the chain, (m, n)."""
+        return self._chain.estimated_jacobian()
+
+
+def with_aids(entry: ControllerEntry, aids: Mapping[str, Any]) -> ControllerEntry:
+    """Return the entry of a controller with aids, whose own settings become the section `law`.
+
+    Raises:
+        ValueError: no such aids.
+    """
+    if not isinstance(aids, Mapping):
+        raise ValueError(f"aids must be servobench.EQUIPPED or a mapping like it, got {aids!r}")  # noqa: TRY004 - one kind
+    chosen = override(f"{entry.name}.aids", AidsConfig(), aids)
+    config = partial(MethodConfig, ConstantConfig(), entry.config(), InitialConfig(), chosen)
+    return replace(entry, config=config, build=partial(AidedController, entry.build))

@@ -2,7 +2,7 @@
 
     Observation → pair → estimate → predict → law → feedforward, posture, limit → Command
 
-Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.parts`; the
+Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.methods`; the
 stages are the aids (`servobench.controllers.aids`). `Servo` is the pure composition, for one run or many side by side;
 `ServoController` holds the state of one run.
 """

@@ -47,8 +47,7 @@ from typing import Any
 import stored_tables
 from page_studies import STUDIES
 from servobench.controllers.aids import EQUIPPED, AidsConfig
-from servobench.controllers.methods import METHODS, PUBLISHED
-from servobench.controllers.parts import ESTIMATORS, LAWS, Part
+from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, PUBLISHED, Part
 from servobench.fmus.export import arm_layout
 from servobench.harness.cli.main import command_line
 from servobench.harness.config import registry

@@ -34,6 +34,22 @@ class BroydenConfig:
     """[rad] smaller motions are left out; 1.4 mm of noise in Δy is then at most 0.14 m/rad."""
 
 
+@settings
+class CfdlConfig:
+    """Settings of the compact-form estimate."""
+
+    step_factor: Annotated[Positive, Lt(2.0)] = 0.5
+    """[1] η; half of the fastest rate."""
+    regularisation: Positive = 1e-3
+    """[rad²] μ, the square of 0.03 rad: smaller motions change Φ little."""
+    min_joint_step: NonNegative = 0.005
+    """[rad] smaller motions are left out: 1 mm of noise hides them."""
+    reset: bool = True
+    """Return to Φ₀ when Φ loses its sign or vanishes."""
+    reset_norm: NonNegative = 1e-2
+    """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
+
+
 def projection_update(
     J: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, step_factor: float, regularisation: float
 ) -> FloatArray:
@@ -51,59 +67,8 @@ def projection_update(
     return np.asarray(J + outer(feature_step - np.matvec(J, joint_step), gain))
 
 
-class BroydenState(NamedTuple):
-    """Ĵ, (..., m, n), m/rad, and whether the last motion was used, (...)."""
-
-    J: FloatArray
-    updated: BoolArray
-
-
-@final
-class BroydenEstimator(Estimator[BroydenState]):
-    """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / ‖Δq‖² for every motion above a minimum ‖Δq‖."""
-
-    def __init__(self, config: BroydenConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings; nothing about the robot is needed."""
-        self._config = config
-
-    def start(self, jacobian: FloatArray) -> BroydenState:
-        """Start from Ĵ₀, (..., m, n), m/rad."""
-        return BroydenState(jacobian, np.full(jacobian.shape[:-2], False))
-
-    def update(self, state: BroydenState, motion: Motion) -> BroydenState:
-        """Correct by one motion."""
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
-
-    def _correct(self, state: BroydenState, motion: Motion) -> BroydenState:
-        dq, dy = motion.joint_step, motion.feature_step
-        return state._replace(
-            J=projection_update(state.J, dq, dy, step_factor=self._config.step_factor, regularisation=0.0)
-        )
-
-    def diagnostics(self, state: BroydenState) -> Diagnostics:
-        """Return whether the last motion was used."""
-        return {"estimator_updated": state.updated}
-
-
-@settings
-class CfdlConfig:
-    """Settings of the compact-form estimate."""
-
-    step_factor: Annotated[Positive, Lt(2.0)] = 0.5
-    """[1] η; half of the fastest rate."""
-    regularisation: Positive = 1e-3
-    """[rad²] μ, the square of 0.03 rad: smaller motions change Φ little."""
-    min_joint_step: NonNegative = 0.005
-    """[rad] smaller motions are left out: 1 mm of noise hides them."""
-    reset: bool = True
-    """Return to Φ₀ when Φ loses its sign or vanishes."""
-    reset_norm: NonNegative = 1e-2
-    """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
-
-
-class CfdlState(NamedTuple):
-    """Φ and Φ₀, (..., m, n), m/rad; whether the last motion was used and how often Φ was reset, (...)."""
+class ProjectionState(NamedTuple):
+    """Ĵ and Ĵ₀, (..., m, n), m/rad; whether the last motion was used and how often Ĵ was reset, (...)."""
 
     J: FloatArray
     J0: FloatArray
@@ -112,38 +77,42 @@ class CfdlState(NamedTuple):
 
 
 @final
-class CfdlEstimator(Estimator[CfdlState]):
-    """Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²), back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
+class ProjectionEstimator(Estimator[ProjectionState]):
+    """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / (μ + ‖Δq‖²) for every motion above a minimum ‖Δq‖; Broyden's update has μ = 0.
+
+    Φ of the compact form goes back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
 
     Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
     changes the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed.
     The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, and Φ stays.
     """
 
-    def __init__(self, config: CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings; nothing about the robot is needed."""
+    def __init__(self, config: BroydenConfig | CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings of either update; nothing about the robot is needed."""
         self._config = config
 
-    def start(self, jacobian: FloatArray) -> CfdlState:
-        """Start from Φ₀, (..., m, n), m/rad."""
+    def start(self, jacobian: FloatArray) -> ProjectionState:
+        """Start from Ĵ₀, (..., m, n), m/rad."""
         lead = jacobian.shape[:-2]
-        return CfdlState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
+        return ProjectionState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
 
-    def update(self, state: CfdlState, motion: Motion) -> CfdlState:
+    def update(self, state: ProjectionState, motion: Motion) -> ProjectionState:
         """Correct by one motion."""
         large = norm(motion.joint_step) >= self._config.min_joint_step
         return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def _correct(self, state: CfdlState, motion: Motion) -> CfdlState:
+    def _correct(self, state: ProjectionState, motion: Motion) -> ProjectionState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
-        J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=config.regularisation)
+        regularisation = config.regularisation if isinstance(config, CfdlConfig) else 0.0
+        J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=regularisation)
         state = state._replace(J=J)
-        if not config.reset:
+        if isinstance(config, BroydenConfig) or not config.reset:
             return state
         flat, first = J.reshape(*J.shape[:-2], -1), state.J0.reshape(*J.shape[:-2], -1)
         lost = (np.vecdot(flat, first) <= 0.0) | (np.vecdot(flat, flat) < config.reset_norm**2)
         return branch(lost, lambda lost: lost._replace(J=lost.J0, resets=lost.resets + 1.0), state)
 
-    def diagnostics(self, state: CfdlState) -> Diagnostics:
-        """Return whether the last motion was used and how often Φ was reset in this run."""
-        return {"estimator_updated": state.updated, "jacobian_resets": state.resets}
+    def diagnostics(self, state: ProjectionState) -> Diagnostics:
+        """Return whether the last motion was used and, of the compact form, how often Φ was reset in this run."""
+        resets = {"jacobian_resets": state.resets} if isinstance(self._config, CfdlConfig) else {}
+        return {"estimator_updated": state.updated, **resets}

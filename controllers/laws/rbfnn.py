@@ -14,8 +14,8 @@ from servobench.controllers.laws.roll_out import RollOut, descent_direction, rol
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
 from servobench.controllers.periods import check_preview, in_periods, sampled
+from servobench.controllers.stages.finish import largest_excess
 from servobench.controllers.stages.joint_response import pushed
-from servobench.controllers.stages.limit import largest_excess
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings

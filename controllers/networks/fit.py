@@ -234,7 +234,7 @@ def _train_jacobian(
     widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
     for index, scale in enumerate(plan.width_scales):
         report(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
-        theta = rbf.jacobian_features(q, centres[None], np.full((1, plan.centres), scale * spread))[:, 0]
+        theta = rbf.hidden_features(q, centres, np.full(plan.centres, scale * spread), "gaussian")
         for W in ridge_path(theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations):
             residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
             square = np.einsum("smn,smn->n", residual, residual)

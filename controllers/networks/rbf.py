@@ -29,27 +29,11 @@ MAX_EXPONENT = 60.0
 MIN_EXPONENT = np.array(-MAX_EXPONENT)
 
 
-def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) -> FloatArray:
-    """Return the hidden layers θ of all joint columns (eqs. 29, 40).
-
-    Args:
-        q: (..., n), rad.
-        centres: c, (n, L, n), or (1, L, n) where the columns share them, rad.
-        widths: δ, (n, L), rad.
-
-    Returns:
-        θ, (..., n, L).
-    """
-    offset = q[..., None, None, :] - centres
-    exponent = np.einsum("...k,...k->...", offset, offset) / widths**2
-    return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
-
-
 def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, kernel: Kernel) -> FloatArray:
-    """Return the hidden layer h of the controller network (eq. 16).
+    """Return the hidden layer h of the controller network (eq. 16), or θ_i of a joint column (eqs. 29, 40).
 
     Args:
-        xi: ξ, (..., p), m and rad.
+        xi: ξ, (..., p), m and rad; for a joint column q, (..., n), rad, and the kernel "gaussian".
         centres: c, (N_h, p).
         widths: γ, (N_h,); for "exponential" γ² has the unit of ξ, for "gaussian" γ has it.
         kernel: "exponential" for exp(−‖ξ − c‖/γ²), "gaussian" for exp(−‖ξ − c‖²/γ²).
@@ -147,7 +131,7 @@ class JacobianNetwork:
         return rows
 
     def features(self, q: FloatArray) -> FloatArray:
-        """Return the U different layers of `jacobian_features`, (..., U, L), at q, (..., n), rad."""
+        """Return the U different layers θ of all columns, (..., U, L), at q, (..., n), rad."""
         centres, ones, decay = self._prepared
         offset = q[..., None, :, None] - centres
         offset *= offset

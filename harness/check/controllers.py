@@ -9,9 +9,9 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from servobench.controllers.aided import with_aids
 from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.controllers.methods import with_aids
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
 from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws

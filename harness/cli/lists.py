@@ -44,7 +44,7 @@ def controllers(
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
-    from servobench.controllers.parts import ESTIMATORS, LAWS
+    from servobench.controllers.methods import ESTIMATORS, LAWS
     from servobench.harness.batch.trials import choose
     from servobench.harness.config.registry import find_controller
     from servobench.harness.config.settings import default_config

@@ -46,7 +46,7 @@ def _plants() -> Names:
 
 
 def _controllers() -> Names:
-    from servobench.controllers.parts import ESTIMATORS
+    from servobench.controllers.methods import ESTIMATORS
     from servobench.harness.config.registry import controller_names
 
     def begun(word: str) -> Iterable[str]:
@@ -57,7 +57,7 @@ def _controllers() -> Names:
 
 
 def _estimators() -> Names:
-    from servobench.controllers.parts import ESTIMATORS
+    from servobench.controllers.methods import ESTIMATORS
 
     return Names(lambda: list(ESTIMATORS), str)
 

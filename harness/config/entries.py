@@ -21,8 +21,8 @@ from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar, get_type_hi
 
 import numpy as np
 
-from servobench.controllers.aided import with_aids
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.controllers.methods import with_aids
 from servobench.harness.config.source import PLACE, SourceFile, describe_at, digest_of_module, import_user_module, show
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World

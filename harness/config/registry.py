@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.controllers.methods import METHODS, compose, suggest_pair
-from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, compose, suggest_pair
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, Own, own_object, read_own
 from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.source import describe_at, is_place

@@ -16,7 +16,7 @@ from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.fit import train
-from servobench.controllers.stages.limit import scale_to_limit
+from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.signals import Observation
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER

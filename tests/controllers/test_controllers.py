@@ -15,10 +15,9 @@ from kit.toy import plant_spec, seen
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial_jacobian import InitialConfig
-from servobench.controllers.methods import METHODS, PUBLISHED, compose
+from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, PUBLISHED, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
 from servobench.controllers.networks.fit import train
-from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.check.controllers import ControllerChecks
 from servobench.harness.config.settings import default_config

@@ -10,7 +10,7 @@ from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorded, Recorder, jacobian_networ
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
-from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator
+from servobench.controllers.estimators.projection import BroydenConfig, ProjectionEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.plant.contract.signals import Observation
 
@@ -33,7 +33,7 @@ def two_joints():
 
 def two_steps(model, **aids):
     """Return stages and state after q = 0 to (0.1, 0.2), in which the feature moved by 0.4; Ĵ₀ = (1.2, 0.5)."""
-    broyden = BroydenEstimator(BroydenConfig(step_factor=0.5))
+    broyden = ProjectionEstimator(BroydenConfig(step_factor=0.5))
     stages = Estimation(broyden, two_joints(), AidsConfig(model=model, **aids), NONE)
     looks = [Observation(0.0, [0.0, 0.0], [0.0]), Observation(PERIOD, [0.1, 0.2], [0.4])]
     state = stages.start(looks[0], np.array([[1.2, 0.5]]))
@@ -129,18 +129,18 @@ def follow(estimator, q, y, knowledge=MODELLED, **aids):
 @pytest.mark.parametrize("delay", ["given", "identified"])
 def test_beside_an_exact_model_the_deviation_learns_nothing(model, delay):
     q = path(60)
-    states, _ = follow(BroydenEstimator(BroydenConfig()), q, features(q, np.eye(M)), model=model, delay=delay)
+    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, np.eye(M)), model=model, delay=delay)
     for k, state in enumerate(states):
         np.testing.assert_allclose(state.learned.estimator.J, 0.0, atol=1e-12)
         np.testing.assert_allclose(state.jacobian, NETWORK.jacobian(q[k]), atol=1e-12)
-    own, _ = follow(BroydenEstimator(BroydenConfig()), q, features(q, np.eye(M)), delay=delay)
+    own, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, np.eye(M)), delay=delay)
     assert np.linalg.norm(own[-1].jacobian - NETWORK.jacobian(q[-1])) > 0.05
 
 
 def test_once_a_turned_camera_is_known_the_deviation_learns_little():
     q = path(150)
     aids = {"model": "regression", "delay": "identified"}
-    states, _ = follow(BroydenEstimator(BroydenConfig()), q, features(q, TURN, delay=2), **aids)
+    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, TURN, delay=2), **aids)
     J = TURN @ NETWORK.jacobian(q[-1])
     assert np.linalg.norm(states[-1].learned.estimator.J) < 0.1 * np.linalg.norm(J)
     np.testing.assert_allclose(states[-1].jacobian, J, atol=0.05)
@@ -151,7 +151,7 @@ def test_the_regression_predicts_where_no_map_explains_and_more_than_the_deviati
     q, rows = path(200), NETWORK.weights.copy()
     rows[-1] *= -0.5
     y, found = features(q, TURN, dataclasses.replace(NETWORK, weights=rows)), []
-    for estimator, model in ((ConstantEstimator(), "regression"), (BroydenEstimator(BroydenConfig()), "nominal")):
+    for estimator, model in ((ConstantEstimator(), "regression"), (ProjectionEstimator(BroydenConfig()), "nominal")):
         states, _ = follow(estimator, q, y, model=model)
         found.append(np.mean([state.learned.unexplained for state in states[100:]]))
     assert found[0] < 0.5 * found[1]
@@ -188,7 +188,7 @@ def test_without_a_nominal_model_the_first_jacobian_stands_for_it():
     q = path(40)
     J = NETWORK.jacobian(q[0])
     unknown = dataclasses.replace(MODELLED, nominal_jacobian=None)
-    stages = Estimation(BroydenEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE)
+    stages = Estimation(ProjectionEstimator(BroydenConfig()), unknown, AidsConfig(model="regression"), NONE)
     state, y = stages.start(Observation(0.0, q[0], np.zeros(M)), J), np.matvec(TURN @ J, q)
     for k in range(40):
         state = stages.update(state, Observation(k * PERIOD, q[k], y[k]), np.zeros(M))

@@ -8,7 +8,7 @@ import pytest
 from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
-from servobench.controllers.parts import ESTIMATORS
+from servobench.controllers.methods import ESTIMATORS
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import trusted_observation

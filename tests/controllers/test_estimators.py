@@ -18,18 +18,17 @@ from servobench.controllers.estimators.kalman import (
 )
 from servobench.controllers.estimators.projection import (
     BroydenConfig,
-    BroydenEstimator,
     CfdlConfig,
-    CfdlEstimator,
+    ProjectionEstimator,
     projection_update,
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
 from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update
 
 LEARNING = [
-    BroydenEstimator(BroydenConfig(step_factor=1.0)),
+    ProjectionEstimator(BroydenConfig(step_factor=1.0)),
     RlsEstimator(RlsConfig()),
-    CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
+    ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
     kalman_estimator(KalmanConfig()),
     ukf_estimator(UkfConfig(form="sigma_points")),
 ]
@@ -82,8 +81,13 @@ def test_a_motion_that_is_just_large_enough_is_used(estimator):
     ("estimator", "jacobian", "dq", "expected"),
     [
         # Δy − JΔq = 0.4 − 0.2 = 0.2, gain = 0.5 · (1, 1) / 2, and with μ = 2 it is 0.5 · (1, 1) / (2 + 2)
-        (BroydenEstimator(BroydenConfig(step_factor=0.5)), [[0.1, 0.1]], [1.0, 1.0], [[0.15, 0.15]]),
-        (CfdlEstimator(CfdlConfig(step_factor=0.5, regularisation=2.0)), [[0.1, 0.1]], [1.0, 1.0], [[0.125, 0.125]]),
+        (ProjectionEstimator(BroydenConfig(step_factor=0.5)), [[0.1, 0.1]], [1.0, 1.0], [[0.15, 0.15]]),
+        (
+            ProjectionEstimator(CfdlConfig(step_factor=0.5, regularisation=2.0)),
+            [[0.1, 0.1]],
+            [1.0, 1.0],
+            [[0.125, 0.125]],
+        ),
         # P = 1/4, r = 2 · 1/8 = 1/4, Δq = (1, 0): S = 1/2, K = (1/2, 0), innovation 0.4 − 0.2 = 0.2
         (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
         (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
@@ -170,8 +174,8 @@ def test_least_squares_forgets_by_the_time_of_a_motion():
 def test_the_compact_form_without_regularisation_is_broydens_update(seed, n, m):
     rng = np.random.default_rng(seed)
     J, dq, dy = rng.normal(size=(m, n)), rng.normal(scale=0.1, size=n), rng.normal(scale=0.1, size=m)
-    broyden = BroydenEstimator(BroydenConfig(step_factor=1.0, min_joint_step=1e-9))
-    compact = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False))
+    broyden = ProjectionEstimator(BroydenConfig(step_factor=1.0, min_joint_step=1e-9))
+    compact = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False))
     found, expected = (each.update(each.start(J), motion(dq, dy)).J for each in (compact, broyden))
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(expected @ dq, dy, atol=1e-11)
@@ -214,7 +218,9 @@ def test_forgetting_does_not_wind_up_while_one_joint_rests():
 
 @pytest.mark.parametrize(("size", "resets"), [(0.011, 0.0), (0.009, 1.0)])
 def test_the_compact_form_returns_to_its_start_when_it_vanishes(size, resets):
-    run = Learning(CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset_norm=0.01)), np.array([[0.5]]))
+    run = Learning(
+        ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset_norm=0.01)), np.array([[0.5]])
+    )
     run.update(motion([0.1], [0.1 * size]))
     assert run.diagnostics()["jacobian_resets"] == resets
     np.testing.assert_allclose(run.jacobian(), [[0.5 if resets else size]], atol=1e-9)
@@ -222,7 +228,7 @@ def test_the_compact_form_returns_to_its_start_when_it_vanishes(size, resets):
 
 def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():
     for reset, expected in ((True, 0.5), (False, -0.5)):
-        estimator = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
+        estimator = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
         run = Learning(estimator, np.array([[0.5]]))
         run.update(motion([0.1], [-0.05]))
         np.testing.assert_allclose(run.jacobian(), [[expected]], atol=1e-9)

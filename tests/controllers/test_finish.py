@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from kit.toy import KNOWLEDGE, LIMIT, PERIOD, A, N
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.stages.finish import Finish
-from servobench.controllers.stages.limit import redistribute, scale_to_limit
+from servobench.controllers.stages.finish import Finish, redistribute, scale_to_limit
 
 NOTHING = np.zeros(())
 

@@ -5,7 +5,7 @@ import pytest
 
 from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, Commanding, M, N, networks
 from servobench.controllers.laws.law import Estimate
-from servobench.controllers.parts import LAWS
+from servobench.controllers.methods import LAWS
 from servobench.plant.contract.signals import trusted_observation
 
 LANES, PERIODS = 3, 60

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from kit.toy import jacobian_network
+from kit.toy import jacobian_features, jacobian_network
 from servobench.controllers.networks.rbf import (
     ControllerNetwork,
     FeatureMemo,
     JacobianNetwork,
     hidden_features,
     information_vector,
-    jacobian_features,
 )
 
 

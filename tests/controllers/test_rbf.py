@@ -6,7 +6,7 @@ import casadi
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, Learning, motion, only_jacobian
+from kit.toy import KNOWLEDGE, Learning, jacobian_features, motion, only_jacobian
 from kit.toy import jacobian_network as network
 from servobench.controllers.estimators.rbf import (
     RbfConfig,
@@ -15,7 +15,7 @@ from servobench.controllers.estimators.rbf import (
     RbfLyapunovEstimator,
     window_step,
 )
-from servobench.controllers.networks.rbf import JacobianNetwork, jacobian_features
+from servobench.controllers.networks.rbf import JacobianNetwork
 
 
 def started(config, net):

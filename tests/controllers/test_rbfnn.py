@@ -14,7 +14,7 @@ from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw, update_share
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
-from servobench.controllers.stages.limit import scale_to_limit
+from servobench.controllers.stages.finish import scale_to_limit
 
 ONES = Estimate(np.ones((2, 3)))
 

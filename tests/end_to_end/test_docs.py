@@ -18,7 +18,7 @@ from kit import console
 from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
 from kit.foreign_fmu import build_crane
 from kit.own import install
-from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.cli.main import app
 from servobench.harness.config import registry
 from servobench.harness.config.settings import read_settings

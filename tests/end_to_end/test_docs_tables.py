@@ -15,8 +15,8 @@ import generated_tables
 from kit.documents import names, read, section, tables
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.initial_jacobian import InitialConfig
+from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.controllers.networks.config import TrainingConfig
-from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment

@@ -11,7 +11,7 @@ import pytest
 from servobench.controllers import servo
 from servobench.controllers.algebra import damped_inverse, nearest_rotation
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.controllers.stages.limit import redistribute
+from servobench.controllers.stages.finish import redistribute
 from servobench.fmus.trace.arrays import NotTraceable, Traced
 from servobench.fmus.trace.branches import NOT_DEFINITE, NOT_FINITE, frame
 from servobench.fmus.trace.record import record, recording

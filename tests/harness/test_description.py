@@ -13,7 +13,7 @@ import pytest
 from kit.command import servobench
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.initial_jacobian import InitialConfig
-from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.description import configuration_file, describe_settings
 from servobench.harness.config.registry import controller_names

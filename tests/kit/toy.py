@@ -11,7 +11,7 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features
 from servobench.controllers.stages.finish import Finish
 from servobench.plant.contract.signals import Observation, PlantSpec
 
@@ -78,6 +78,12 @@ class Learning:
 
     def diagnostics(self):
         return self.estimator.diagnostics(self.state)
+
+
+def jacobian_features(q, centres, widths):
+    """Return the hidden layers θ of all joint columns by the plain formula, (..., n, L), at q, (..., n), rad."""
+    layers = [hidden_features(q, *column, "gaussian") for column in zip(centres, widths, strict=True)]
+    return np.stack(layers, axis=-2)
 
 
 def jacobian_network(n=3, m=2, units=4, seed=0):

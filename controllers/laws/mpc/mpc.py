@@ -10,7 +10,7 @@ from servobench.controllers.laws.law import Estimate, Law, Stage
 from servobench.controllers.laws.mpc import closed_form
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver, exceeds, joint_bounds, view_rows
 from servobench.controllers.periods import check_preview, sampled
-from servobench.controllers.stages.limit import scale_to_limit
+from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.lanes import branch, lane_by_lane, norm, transposed, where

@@ -9,7 +9,7 @@ from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.pid import PidConfig, PidLaw
 from servobench.controllers.servo import Servo, ServoController
-from servobench.controllers.stages.limit import scale_to_limit
+from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.lanes import branch, norm, outer
 from servobench.plant.contract.signals import Command, Observation
