@@ -18,11 +18,10 @@ from measuring import asked_to_be_quick, table
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 from servobench.plant.rendered.detection import find_ball
-from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation
 from servobench.plant.rendered.room import Room
-from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.settings import DriveConfig, RenderedConfig
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch

@@ -16,8 +16,8 @@ from typing import cast
 import numpy as np
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.bullet import BulletScene

@@ -15,8 +15,8 @@ from servobench.fmus.product import Product, c_files, check_version, documentati
 from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import SETUPS, Sensing
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servobench.fmus.variables import FEATURE, SEEN, Actuation, Layout
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import discretise_lag

@@ -11,8 +11,8 @@ from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.sensing import SensingConfig

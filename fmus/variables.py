@@ -15,8 +15,7 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from servobench.plant.cameras.model import Mount, SetupModel
-from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel

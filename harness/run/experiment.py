@@ -27,9 +27,9 @@ from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.lanes import stack

@@ -25,7 +25,7 @@ from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import ImageReference, Reference
 from servobench.harness.run.scenario import Scenario
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.run.log import column_unit
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table

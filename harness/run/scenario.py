@@ -12,7 +12,7 @@ from typing import ClassVar, Self, TypeAlias
 import numpy as np
 
 from servobench.harness.run.references import FixedPoint, FollowedCurve, Reference, TaskKind, TaughtImage
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import RobotModel

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from annotated_types import Gt, Le
 
 from servobench.harness.run.scenario import Scenario, Task, TaskSetting
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings

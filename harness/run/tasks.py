@@ -20,7 +20,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path

@@ -24,9 +24,8 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.cameras.model import Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics
-from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.robot.arm import SerialArm

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from servobench.plant.cameras.model import Mount
 from servobench.plant.cameras.placement import ON_HAND, OPTICAL, CameraDraws, draw_cameras, nominal_model, true_model
-from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO, SensingSetup
+from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO, Mount, SensingSetup
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample

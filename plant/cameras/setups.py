@@ -1,4 +1,4 @@
-"""The contract of a sensing set-up, the features that are computed from points in camera frames, and the built-in ones.
+"""The contract of a sensing set-up, the built-in ones, and an arm in front of cameras, or with cameras on its hand.
 
 A set-up is one `SensingSetup`: names and unit of its features, the number of cameras, the points of the target, and the
 function from the points, in the frame of each camera, to the features. Arm, mount, mismatch, tasks and scale follow.
@@ -10,19 +10,33 @@ function from the points, in the frame of each camera, to the features. Arm, mou
 
 A further set-up is a `SensingSetup` in this file and its name in `plant.cameras.registry`, or one in a file that a user
 names on the command line.
+
+A camera is mounted on the base B (`fixed`) or on the flange F (`hand`); the target is on the flange or in the world:
+
+    fixed   p = p_B(q) = p_F + R_F t           ∂p/∂q_i = g_i z_i × (p_B − o_i)
+    hand    p = R_Fᵀ (t − p_F)                 ∂p/∂q_i = −R_Fᵀ (g_i z_i × (t − o_i))
+    in camera c, p_c = R_cᵀ (p − p_0c);        y = h(p_c),   J = ∂h/∂p_c R_cᵀ ∂p/∂q
+
+with points t of the target in the flange frame or in the base frame, and the joints' axes z_i, origins o_i and gear
+ratios g_i.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import Final, TypeAlias
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Final, Literal, Self, TypeAlias, final
 
 import numpy as np
+import numpy.typing as npt
 
-from servobench.plant.cameras.optics import Optics, project, project_rates
+from servobench.plant.cameras.optics import Optics, in_image, project, project_rates
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import SETTLING_BAND, BoolArray, Channel
+from servobench.plant.robot.arm import YZX, ZXY, SerialArm
+from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.hand_eye import RobotModel
 
 Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
@@ -161,3 +175,152 @@ PLATE = in_pixels(
     least_joints=6,
     judges_pose=True,
 )
+
+
+Mount: TypeAlias = Literal["fixed", "hand"]
+"""Whether the cameras are beside the arm and the target on it, or the reverse."""
+MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate are not valid
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SetupModel(RobotModel):
+    """An arm and its cameras under a sensing set-up; arrays have the leading axes of the arm's.
+
+    Attributes:
+        arm: the arm.
+        setup: the set-up.
+        mount: of the cameras.
+        cameras: (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
+        optics: their intrinsics.
+        target: (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
+        distance: from the cameras to the target in the middle of the workspace, as planned [m].
+        planned: image of a camera as planned, whose focal length decides the natural size of a feature.
+        far: distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m].
+    """
+
+    arm: SerialArm
+    setup: SensingSetup
+    mount: Mount
+    cameras: FloatArray
+    optics: Optics
+    target: FloatArray
+    distance: float
+    planned: PinholeCamera
+    far: float
+
+    @cached_property
+    def channel(self) -> Channel:
+        """Names, unit and natural size of the features."""
+        return self.setup.channel(self.planned.focal, self.distance)
+
+    @property
+    def noise_unit(self) -> float:
+        """A metre of noise in the unit of the features; pixels have the same noise at every distance."""
+        return self.setup.scale(self.planned.focal, self.far)
+
+    @property
+    def camera(self) -> FloatArray:
+        """The pose of the first camera, (..., 4, 4)."""
+        return self.cameras[..., 0, :, :]
+
+    def with_camera(self, pose: FloatArray) -> Self:
+        """Return this model with its first camera at another pose, (..., 4, 4)."""
+        cameras = self.cameras.copy()
+        cameras[..., 0, :, :] = pose
+        return replace(self, cameras=cameras)
+
+    def pivot(self, centre: npt.ArrayLike) -> FloatArray:
+        """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""
+        if self.mount == "fixed":
+            return np.asarray(centre, dtype=np.float64)
+        return np.asarray(self.camera[..., :3, 3] + self.distance * self.camera[..., :3, 2])
+
+    def points(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""
+        flange = self.arm.frames(joint_position)[..., -1, :, :]
+        return self._mounted(flange, self._in_base(flange))
+
+    def feature_at(self, points: FloatArray) -> FloatArray:
+        """Return the features, (..., m), of a target at `points` (..., p, 3) m in the frame of the cameras' mount."""
+        return self.setup.measure(self._in_cameras(points), self.optics)
+
+    def valid_at(self, points: FloatArray, share: float = 1.0) -> BoolArray:
+        """Return which features of such a target are valid, (..., m), within a share of the images' half sides."""
+        return self._valid(self._in_cameras(points), share)
+
+    def incidence(self, points: FloatArray) -> FloatArray:
+        """Return the cosine of the angle between a plate's normal and the first camera's ray, (...); 1 for a point."""
+        return _incidence(self._in_cameras(points)[..., 0, :, :])
+
+    def valid(self, joint_position: npt.ArrayLike) -> BoolArray | None:
+        """Return which features can be measured, (..., m)."""
+        return self.valid_at(self.points(joint_position))
+
+    def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the true features, (..., m), for joint positions (..., n) in rad."""
+        return self.feature_at(self.points(joint_position))
+
+    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return features (..., m), Jacobian (..., m, n) and which features are valid (..., m), all read-only."""
+        points, motions = self.point_motions(joint_position)
+        y = self.setup.measure(points, self.optics)
+        J = self.setup.change(points, motions, self.optics)
+        valid = self._valid(points)
+        for array in (y, J, valid):
+            array.setflags(write=False)
+        return y, J, valid
+
+    def point_motions(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
+        frames = self.arm.frames(joint_position)
+        flange = frames[..., -1, :, :]
+        at = self._in_base(flange)
+        motions = self._motions(frames, at)
+        if self.mount == "hand":
+            motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
+        points = self._in_cameras(self._mounted(flange, at))
+        # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
+        turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
+        return points, np.swapaxes(turned, -1, -2)
+
+    def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
+        """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""
+        front = _incidence(points) > MIN_INCIDENCE
+        return self.setup.valid(np.logical_and(in_image(points, self.optics, share), front[..., None]))
+
+    def _in_base(self, flange: FloatArray) -> FloatArray:
+        """Return the target in the base frame, (..., p, 3) m."""
+        if self.mount == "hand":
+            return self.target
+        return np.asarray(np.matvec(flange[..., None, :3, :3], self.target) + flange[..., None, :3, 3])
+
+    def _mounted(self, flange: FloatArray, at: FloatArray) -> FloatArray:
+        """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
+        if self.mount == "fixed":
+            return at
+        return np.asarray(np.vecmat(at - flange[..., None, :3, 3], flange[..., None, :3, :3]))
+
+    def _in_cameras(self, points: FloatArray) -> FloatArray:
+        """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
+        cameras = self.cameras[..., None, :, :]
+        return np.asarray(np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3]))
+
+    def _motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
+        """Return g_i z_i × (p − o_i) of points (..., p, 3) m in the base frame, (..., p, n, 3) m/rad."""
+        n = self.arm.n
+        axis = frames[..., None, :n, :3, 2]
+        lever = points[..., :, None, :] - frames[..., None, :n, :3, 3]
+        motions = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
+        motions -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
+        motions *= self.arm.gear_ratio[..., None, :, None]
+        return np.asarray(motions)
+
+
+def _incidence(points: FloatArray) -> FloatArray:
+    """Return the cosine of the angle between a target's normal and the ray to its middle, (...), for (..., p, 3) m."""
+    if points.shape[-2] < 3:
+        return np.ones(points.shape[:-2])
+    first, second = points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :]
+    normal, ray = np.cross(first, second), points.mean(axis=-2)
+    return np.asarray(np.vecdot(normal, ray) / np.maximum(norm(normal) * norm(ray), 1e-12))

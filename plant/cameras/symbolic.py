@@ -14,9 +14,8 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics, project
-from servobench.plant.cameras.setups import POSITION, SensingSetup
+from servobench.plant.cameras.setups import MIN_INCIDENCE, POSITION, Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.robot.arm import SerialArm

@@ -1,17 +1,22 @@
 """One interface to an instance of an FMU for FMI 2 and FMI 3, with its ports and saved states.
 
-A model-exchange FMU is integrated. The libraries are called by ctypes with argument objects that are made once: a call
-then costs a third of a microsecond, whereas converting lists at every call costs several.
+An FMU of model exchange is stepped by the solver CVode that fmpy brings. Between two steps it is in event mode, where
+commands of any kind may be set. A step goes through its events: those of time exactly, those of state where an
+indicator changes sign.
+
+The libraries are called by ctypes with argument objects that are made once: a call then costs a third of a
+microsecond, whereas converting lists at every call costs several.
 """
 
 import contextlib
 import ctypes
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias
+from types import SimpleNamespace
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +24,6 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
-from servobench.plant.fmu.integrator import Integrator
 from servobench.plant.fmu.library import (
     NO_OPTIONS,
     InstanceOptions,
@@ -35,6 +39,9 @@ Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word i
 RawCall: TypeAlias = Callable[[], int]  # The caller has to check the returned status.
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
 MIN_PROGRESS = 1e-9  # least share of a step for a partial step
+RELATIVE_TOLERANCE: Final = 1e-8
+MAX_SOLVER_STEPS: Final = 100_000  # steps of CVode in one step of the plant
+MAX_EVENT_ITERATIONS: Final = 1000  # iterations at one instant
 
 
 class Port:
@@ -68,22 +75,6 @@ class Port:
     def pointer(self, row: int = 0) -> ctypes.c_void_p:
         """Return a row of the buffer, for C."""
         return ctypes.c_void_p(self._address + row * self.values.shape[-1] * self.values.itemsize)
-
-
-@dataclass(frozen=True, eq=False)
-class FmuState:
-    """A saved state of an FMU's world.
-
-    Attributes:
-        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
-            world that saved it.
-        period: number of periods since the start.
-        integrated: (..., n), rad, joint positions of an FMU that has none itself.
-    """
-
-    fmu: tuple[bytes | ctypes.c_void_p, ...]
-    period: int
-    integrated: FloatArray
 
 
 class Instance(ABC):
@@ -155,7 +146,7 @@ class Instance(ABC):
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
         self._initialise(time)
-        self._integrator = Integrator(self, self.derivatives)
+        self._integrator = Integrator(self)
         self._begun = True
 
     @abstractmethod
@@ -380,3 +371,109 @@ class Instance(ABC):
         except AttributeError as error:
             file = self.description.path.name
             raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error
+
+
+class Integrator:
+    """dx/dt = f(x, u) with events, from one step to the next under held inputs u."""
+
+    def __init__(self, instance: Instance) -> None:
+        """Take an instance of model exchange in event mode."""
+        self._instance = instance
+        self._solver: Any = None
+        self._fault: FmuError | None = None
+
+    def advance(self, time: float, step: float) -> None:
+        """Take a step of size `step`, s, from `time`, s.
+
+        Raises:
+            FmuError: the FMU refused something, wants to end, or the solver found no way.
+        """
+        event_time, end = self._settle(), time + step
+        self._begin(time)
+        while time < end:
+            reached = self._solve(time, min(end, event_time))
+            time = end if math.isclose(reached[1], end, rel_tol=1e-14, abs_tol=1e-14) else reached[1]
+            self._instance.call("SetTime", ctypes.c_double(time))
+            if (reached[0] or self._asks_for_event() or time >= event_time) and time < end:
+                self._instance.call("EnterEventMode")
+                event_time = self._settle()
+                self._begin(time)
+        self._instance.call("EnterEventMode")
+
+    def _settle(self) -> float:
+        """Update the discrete states until they are settled; return the time of the next event, or infinity."""
+        for _ in range(MAX_EVENT_ITERATIONS):
+            again, ends, following = self._instance.update_discrete_states()
+            if ends:
+                raise FmuError(f"{self._instance.description.path.name} asked to end the simulation")
+            if not again:
+                self._instance.call("EnterContinuousTimeMode")
+                return following
+        raise FmuError(f"{self._instance.description.path.name}: discrete states do not settle at an event")
+
+    def _asks_for_event(self) -> bool:
+        enter, ends = ctypes.c_int(), ctypes.c_int()
+        self._instance.call("CompletedIntegratorStep", ctypes.c_int(1), ctypes.byref(enter), ctypes.byref(ends))
+        if ends.value:
+            raise FmuError(f"{self._instance.description.path.name} asked to end the simulation")
+        return bool(enter.value)
+
+    def _begin(self, time: float) -> None:
+        """Start the solver from the present states."""
+        if self._solver is None:
+            self._solver = self._make(time)
+        else:
+            self._solver.reset(time)
+        self._raise_fault()
+
+    def _solve(self, time: float, until: float) -> tuple[bool, float]:
+        """Return whether a state event ended the integration before `until`, and the time reached."""
+        try:
+            event, _, reached = self._solver.step(time, until)
+        except RuntimeError as error:
+            self._raise_fault()
+            words = " ".join(str(error).split())
+            raise FmuError(f"{self._instance.description.path.name} cannot be integrated: {words}") from error
+        self._raise_fault()
+        return bool(event), float(reached)
+
+    def _raise_fault(self) -> None:
+        if self._fault is not None:
+            raise self._fault
+
+    def _make(self, time: float) -> Any:  # noqa: ANN401 - fmpy's solver carries no types
+        try:
+            from fmpy.sundials import CVodeSolver  # noqa: PLC0415 - a library that not every platform has
+        except OSError as error:
+            name = self._instance.description.path.name
+            raise FmuError(f"{name} offers model exchange only, and fmpy has no solver for this machine") from error
+        description = self._instance.description
+        return CVodeSolver(
+            nx=description.n_states,
+            nz=description.n_indicators,
+            get_x=self._vector("GetContinuousStates"),
+            set_x=self._vector("SetContinuousStates"),
+            get_dx=self._vector(self._instance.derivatives),
+            get_z=self._vector("GetEventIndicators"),
+            get_nominals=self._vector("GetNominalsOfContinuousStates"),
+            set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
+            input=SimpleNamespace(apply=lambda _time: None),  # Inputs stay as they are within a step.
+            startTime=time,
+            relativeTolerance=self._instance.options.tolerance or RELATIVE_TOLERANCE,
+            maxNumSteps=MAX_SOLVER_STEPS,
+        )
+
+    def _vector(self, name: str) -> Callable[..., None]:
+        return self._guarded(lambda values, size: self._instance.call(name, values, ctypes.c_size_t(size)))
+
+    def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback for C that stores the first exception in place of raising it."""
+
+        def guarded(*arguments: Any) -> None:  # noqa: ANN401 - of the solver
+            if self._fault is None:
+                try:
+                    act(*arguments)
+                except FmuError as fault:
+                    self._fault = fault
+
+        return guarded

@@ -1,4 +1,4 @@
-"""Reads the model-exchange side of an FMU back into CasADi: the feature and its Jacobian by the FMU's own derivatives.
+"""An FMU that offers model exchange, read back into CasADi: feature and Jacobian are those of its own derivatives.
 
     q -> (y, ∂y/∂q)
 

@@ -7,7 +7,7 @@ are set before every run.
 
 import ctypes
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,7 @@ from servobench.plant.contract.settings import Delay, Names, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
-from servobench.plant.fmu.instance import FmuState, Instance, Port
+from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import Instances, Lane
 from servobench.plant.fmu.library import InstanceOptions, logger
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
@@ -54,6 +54,22 @@ class FmuConfig:
     """Noise, latency, frame period and lost frames."""
     isolate: bool = True
     """Carry its runs out in a process of their own, with limits; false for an FMU that you trust like servobench."""
+
+
+@dataclass(frozen=True, eq=False)
+class FmuState:
+    """A saved state of an FMU's world.
+
+    Attributes:
+        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
+            world that saved it.
+        period: number of periods since the start.
+        integrated: (..., n), rad, joint positions of an FMU that has none itself.
+    """
+
+    fmu: tuple[bytes | ctypes.c_void_p, ...]
+    period: int
+    integrated: FloatArray
 
 
 class FmuWorld(World):

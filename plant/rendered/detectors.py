@@ -21,9 +21,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate
-from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import BoolArray, Truth

@@ -24,72 +24,14 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.settings import NonNegative, Positive, Share, settings
-from servobench.plant.robot import ur5
-from servobench.plant.robot.robot import Robot
+from servobench.plant.rendered.settings import DriveConfig
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
 # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
 POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
-RATED_PAYLOAD = 5.0  # [kg] of a UR5
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further
-
-
-@settings
-class DriveConfig:
-    """Settings of the joints' drives: lists have one number for all joints or one for each."""
-
-    dynamics: bool = True
-    """Torque-driven joints; without it they follow the lag exactly, without mass, load and friction."""
-    velocity_bandwidth: tuple[Positive, ...] = (15.0, 15.0, 15.0, 20.0, 20.0, 20.0)
-    """[Hz] of each velocity loop; in no data sheet: chosen so that joints rise in about 50 ms, as on `kinematic`."""
-    torque_limit: tuple[Positive, ...] = ur5.MAX_TORQUE
-    """[Nm] of each joint, by its maker; these of Universal Robots, "Max. joint torques"."""
-    rotor_inertia: tuple[NonNegative, ...] = (0.1,)
-    """[kg m²] of the rotor, times the gear's ratio squared; that of the UR5e in MuJoCo Menagerie, in no data sheet."""
-    coulomb_friction: tuple[NonNegative, ...] = (7.5, 7.5, 7.5, 1.4, 1.4, 1.4)
-    """[Nm] 5 % of the torque limit; an order of magnitude for strain-wave gears, in no data sheet."""
-    viscous_friction: tuple[NonNegative, ...] = (7.5, 7.5, 7.5, 1.4, 1.4, 1.4)
-    """[Nm s/rad] at 1 rad/s as much as Coulomb friction; an order of magnitude, too."""
-    friction_compensation: Share = 0.8
-    """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
-    payload: NonNegative = 2.5
-    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
-    assumed_payload: NonNegative = 0.9
-    """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
-
-    def check(self, n: int) -> None:
-        """Refuse lists that do not fit `n` joints.
-
-        Raises:
-            ValueError: a list of another length.
-        """
-        for name in ("velocity_bandwidth", "torque_limit", "rotor_inertia", "coulomb_friction", "viscous_friction"):
-            if len(getattr(self, name)) not in {1, n}:
-                raise ValueError(f"{name} must have 1 or {n} numbers, got {len(getattr(self, name))}")
-
-
-def drives_for(robot: Robot) -> DriveConfig:
-    """Return the settings of the drives of an arm: those of the UR5, in proportion to its joints' torques and its load.
-
-    Joints of at least half the torque of the strongest one have the bandwidth of a shoulder, the others of a wrist.
-    """
-    own, default = robot.links.torque, DriveConfig()
-    share = own / ur5.MAX_TORQUE[0]
-    friction = default.coulomb_friction[0] * share
-    slow, fast = default.velocity_bandwidth[0], default.velocity_bandwidth[-1]
-    load = robot.links.payload / RATED_PAYLOAD
-    return DriveConfig(
-        velocity_bandwidth=tuple(np.where(own >= own.max() / 2.0, slow, fast).tolist()),
-        torque_limit=tuple(own.tolist()),
-        rotor_inertia=(default.rotor_inertia[0] * float(share.max()),),
-        coulomb_friction=tuple(friction.tolist()),
-        viscous_friction=tuple(friction.tolist()),
-        payload=default.payload * load,
-        assumed_payload=default.assumed_payload * load,
-    )
 
 
 class DriveState(NamedTuple):

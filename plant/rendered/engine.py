@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window
-from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.room import Room
-from servobench.plant.rendered.urdf import Box
+from servobench.plant.rendered.settings import Box, DriveConfig
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot

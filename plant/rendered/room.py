@@ -10,11 +10,11 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.cameras.model import SetupModel
-from servobench.plant.cameras.setups import HALF
+from servobench.plant.cameras.setups import HALF, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered import urdf
 from servobench.plant.rendered.marks import MARK_COLOURS, RED
+from servobench.plant.rendered.settings import Box
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
@@ -75,7 +75,7 @@ class Room:
     arm: SerialArm  # the true kinematics
     scenery: bool  # whether the table and the floor are there
     robot: Robot  # by its maker's description, for the visual shapes
-    boxes: tuple[urdf.Box, ...] = ()  # obstacles
+    boxes: tuple[Box, ...] = ()  # obstacles
     rig: Rig | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
 
     def files(self) -> dict[str, str]:

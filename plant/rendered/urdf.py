@@ -9,7 +9,6 @@ coarse that its front lies 6 % of the radius too deep, and its boxes draw six fa
 """
 
 from functools import lru_cache
-from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.marks import RED, Colour
+from servobench.plant.rendered.settings import Box
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.robot import Robot
 
@@ -174,14 +174,6 @@ def rectangles_obj(rectangles: list[tuple[float, float, float, float]], height: 
         a, b, c, d = (f"{first + k}//1" for k in range(4))
         lines += [f"f {a} {b} {c}", f"f {a} {c} {d}"]
     return "\n".join(lines) + "\n"
-
-
-class Box(NamedTuple):
-    """A box in the room, parallel to the axes of the base frame."""
-
-    name: str  # in error messages
-    centre: tuple[float, float, float]  # (3,) [m], base frame
-    size: tuple[float, float, float]  # (3,) [m], its three sides
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool) -> str:

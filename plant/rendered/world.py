@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.bench.plant import PlantSetup, World
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth

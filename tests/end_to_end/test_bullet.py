@@ -15,9 +15,10 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.bullet import BulletSimulation
-from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
+from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.plants import BULLET
+from servobench.plant.rendered.settings import DriveConfig
 
 
 @pytest.fixture

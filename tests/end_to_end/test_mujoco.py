@@ -12,9 +12,9 @@ from kit.plants import NEEDS_BULLET, mismatched
 from kit.rendered import BARE, HOME, IDEAL, MODEL, UR5, build
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.mujoco import MujocoScene, describe_renderer
 from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.settings import DriveConfig
 from servobench.plant.robot.camera import PinholeCamera
 
 ROBOTS = 4

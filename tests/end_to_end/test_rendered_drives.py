@@ -8,7 +8,8 @@ import pytest
 from kit.rendered import BARE, HOME, IDEAL, MODEL, geared_ur5
 from servobench.plant.contract.faults import Collision, FeatureLost
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
+from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.settings import DriveConfig
 
 
 def turn(plant, joint_velocity, periods) -> None:

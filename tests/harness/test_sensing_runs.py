@@ -28,7 +28,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.cameras.model import SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot

@@ -6,8 +6,7 @@ from kit.plants import configure
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.drives import DriveConfig
-from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.settings import DriveConfig, RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.optics import in_image, locate, project, project_rates
 from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.sensing import SensingConfig

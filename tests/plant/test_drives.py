@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servobench.plant.rendered.drives import PHYSICS_STEP, STICKING_SPEED, DriveConfig, Drives, DriveState, RigidBody
-from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.drives import PHYSICS_STEP, STICKING_SPEED, Drives, DriveState, RigidBody
+from servobench.plant.rendered.settings import DriveConfig, RenderedConfig
 
 FREE = DriveConfig(
     coulomb_friction=(0.0,),

@@ -10,7 +10,7 @@ import pytest
 
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.contract.settings import remark
-from servobench.plant.rendered.drives import DriveConfig, drives_for
+from servobench.plant.rendered.settings import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
 from servobench.plant.robot.catalogue import ROBOTS, find_robot, random_robot

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS
-from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.optics import Optics, in_image, project
 from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
-from servobench.plant.cameras.setups import SensingSetup
+from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.camera import CAMERA
