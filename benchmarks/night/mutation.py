@@ -51,7 +51,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     ),
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
     "statistics": (
-        ("harness/analysis/statistics.py", "harness/analysis/scores.py"),
+        ("harness/analysis/comparison.py", "harness/analysis/scores.py"),
         ("harness/test_statistics.py", "harness/test_scores.py"),
     ),
     "results": (

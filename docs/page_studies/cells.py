@@ -12,21 +12,19 @@ import pandas as pd
 from page_studies.study import ENGINES
 from servobench.harness.analysis.comparison import (
     CURVE,
-    achieved_share,
-    column_of,
-    compare_pairs,
-    outcomes,
-    settled_share,
-    settling_times,
-    texts_of,
-)
-from servobench.harness.analysis.statistics import (
     MISSING,
     Difference,
     Estimate,
+    achieved_share,
+    column_of,
+    compare_pairs,
     mean_with_interval,
     median_with_interval,
+    outcomes,
+    settled_share,
+    settling_times,
     tail_mean,
+    texts_of,
 )
 from servobench.harness.run.result import COMPLETED
 

@@ -21,8 +21,7 @@ from scipy.stats import rankdata
 
 from page_studies.cells import by_method, ended_early, quoted, rows_by_method, settled
 from page_studies.study import FIVE, Study, Words, settings, sweep
-from servobench.harness.analysis.comparison import settling_times
-from servobench.harness.analysis.statistics import success_rate
+from servobench.harness.analysis.comparison import settling_times, success_rate
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms

@@ -26,7 +26,7 @@ from page_studies.study import (
     sweep,
 )
 from servobench.controllers.aids import SWITCHES, AidsConfig
-from servobench.harness.analysis.statistics import MISSING
+from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import default_config, tuned_file

@@ -13,8 +13,14 @@ import pandas as pd
 
 from page_studies import cells
 from page_studies.study import BOTH, ENGINES, RENDERED, Study, Words, on_engines, settings, sweep
-from servobench.harness.analysis.comparison import column_of, margin, settling_times
-from servobench.harness.analysis.statistics import MISSING, is_majority, median_with_interval
+from servobench.harness.analysis.comparison import (
+    MISSING,
+    column_of,
+    is_majority,
+    margin,
+    median_with_interval,
+    settling_times,
+)
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.result import COMPLETED
 

@@ -10,8 +10,7 @@ from PIL import Image
 from page_studies.cells import by_method, marked, quoted
 from page_studies.pictures import small
 from page_studies.study import ENGINES, FOUR, SUFFIX, Study, Words, on_engines
-from servobench.harness.analysis.comparison import settling_times
-from servobench.harness.analysis.statistics import is_majority
+from servobench.harness.analysis.comparison import is_majority, settling_times
 from servobench.harness.batch.results import load_runs
 from servobench.harness.studies.robustness import KNOWN_LINES
 

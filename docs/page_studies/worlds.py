@@ -11,8 +11,7 @@ import pandas as pd
 from page_studies import cells
 from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, settings, sweep
 from servobench.controllers.methods import ESTIMATORS, LAWS
-from servobench.harness.analysis.comparison import column_of
-from servobench.harness.analysis.statistics import median_with_interval
+from servobench.harness.analysis.comparison import column_of, median_with_interval
 from servobench.harness.batch.results import load_runs
 
 SEEDS = "500:600"

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from servobench.harness.analysis.statistics import ALPHA, CONFIDENCE, RESAMPLES, Estimate, holm
+from servobench.harness.analysis.comparison import ALPHA, CONFIDENCE, RESAMPLES, Estimate, holm
 from servobench.plant.contract.checks import FloatArray
 
 TRIMMED: Final = 0.25  # share of the scores that an interquartile mean leaves out at each end

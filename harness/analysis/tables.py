@@ -18,7 +18,10 @@ import pandas as pd
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis.comparison import (
     CURVE,
+    MISSING,
+    NO_ESTIMATE,
     POINT_TO_POINT,
+    Estimate,
     achieved_share,
     achievement,
     column_of,
@@ -27,7 +30,9 @@ from servobench.harness.analysis.comparison import (
     in_handy_units,
     is_superfluous,
     margin,
+    median_with_interval,
     metric_heading,
+    number,
     outcomes,
     settling_band,
     settling_times,
@@ -35,17 +40,10 @@ from servobench.harness.analysis.comparison import (
     shown_value,
     split_conditions,
     split_tasks,
-    texts_of,
-    with_places,
-)
-from servobench.harness.analysis.statistics import (
-    MISSING,
-    NO_ESTIMATE,
-    Estimate,
-    median_with_interval,
-    number,
     success_rate,
     tail_mean,
+    texts_of,
+    with_places,
 )
 from servobench.harness.analysis.verdict import judged_metric, judged_values
 from servobench.harness.run.metrics import METRICS

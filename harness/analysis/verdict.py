@@ -1,7 +1,7 @@
 """The result of a results folder in a sentence or two, and the leading controller in each place.
 
 In one place controllers are told apart by the verdict on their paired difference, see
-`servobench.harness.analysis.statistics.paired_difference`, success rates by a sign test over seeds: a seed counts once,
+`servobench.harness.analysis.comparison.paired_difference`, success rates by a sign test over seeds: a seed counts once,
 however many tasks it was run on, as runs of one seed share a robot. Controllers that know the true robot are bounds and
 are not ranked.
 """
@@ -15,23 +15,21 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import (
+    MIN_PAIRS,
+    Difference,
     achieved_share,
     column_of,
     grouped,
+    is_majority,
     knows_truth,
     margin,
+    median_with_interval,
     outcomes,
+    paired_difference,
     settling_times,
     shown_unit,
     split_conditions,
     split_tasks,
-)
-from servobench.harness.analysis.statistics import (
-    MIN_PAIRS,
-    Difference,
-    is_majority,
-    median_with_interval,
-    paired_difference,
 )
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED

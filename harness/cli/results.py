@@ -63,7 +63,7 @@ def statistics(
         say(f"% {missing}" if latex else missing)
     tables = statistics_tables(runs, metric)
     if latex:
-        from servobench.harness.analysis.paper import latex_tables, methods_paragraph
+        from servobench.harness.analysis.folder import latex_tables, methods_paragraph
 
         say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
         return

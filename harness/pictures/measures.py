@@ -17,7 +17,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pandas.api.types import is_numeric_dtype
 
 from servobench.harness.analysis import comparison
-from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
+from servobench.harness.analysis.comparison import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.style import (
     LETTER,
     TEXT,

@@ -19,8 +19,8 @@ from markupsafe import Markup, escape
 
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import comparison, tables
+from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
-from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.robots import DEFAULT_ROBOT

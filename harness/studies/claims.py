@@ -13,7 +13,7 @@ The rules, fixed before the runs were made:
 | 7 keeps up | the mean Jacobian error is *better* with learning online than without in all five tasks |
 
 A rule that holds in none of its cases is *not reproduced*, one that holds in some *depends on* them. A case that is
-*undecided* needs more robots. Verdicts, margins and lost runs are those of `servobench.harness.analysis.statistics` and
+*undecided* needs more robots. Verdicts, margins and lost runs are those of `servobench.harness.analysis.comparison` and
 `comparison`; in claim 4 a run that never settles counts as its whole duration.
 """
 
@@ -25,12 +25,13 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.analysis.comparison import margin, settling_times
-from servobench.harness.analysis.statistics import (
+from servobench.harness.analysis.comparison import (
     Estimate,
     Verdict,
+    margin,
     median_with_interval,
     paired_difference,
+    settling_times,
     success_rate,
 )
 from servobench.harness.batch.campaign import Campaign

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.statistics import NO_ESTIMATE
+from servobench.harness.analysis.comparison import NO_ESTIMATE
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.config.registry import find_plant

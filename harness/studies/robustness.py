@@ -15,9 +15,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from servobench.harness.analysis.comparison import settled_share, settling_band, settling_times
+from servobench.harness.analysis.comparison import (
+    Estimate,
+    median_with_interval,
+    settled_share,
+    settling_band,
+    settling_times,
+)
 from servobench.harness.analysis.loops.loop_analysis import latency_border
-from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place

@@ -17,9 +17,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import column_of, outcomes
+from servobench.harness.analysis.comparison import column_of, median_with_interval, outcomes, success_rate
 from servobench.harness.analysis.scores import profile, ranking, resolution, scores
-from servobench.harness.analysis.statistics import median_with_interval, success_rate
 from servobench.harness.analysis.tables import Cell, Row, as_plain, as_text
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts, check_effects
 from servobench.harness.batch.plan import Cell as Run

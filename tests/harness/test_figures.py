@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
-from servobench.harness.analysis.statistics import Estimate
+from servobench.harness.analysis.comparison import Estimate
 from servobench.harness.batch import results
 from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths

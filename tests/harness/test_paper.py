@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
-from servobench.harness.analysis.paper import latex_tables
+from servobench.harness.analysis.folder import latex_tables
 
 TABLE = pd.DataFrame(
     {

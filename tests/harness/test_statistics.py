@@ -12,17 +12,20 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 from statsmodels.stats.weightstats import ttost_paired
 
-from servobench.harness.analysis import statistics
-from servobench.harness.analysis.comparison import compare_pairs, margin, outcomes, settling_times
-from servobench.harness.analysis.statistics import (
+from servobench.harness.analysis import comparison as statistics
+from servobench.harness.analysis.comparison import (
     NO_ESTIMATE,
     Estimate,
+    compare_pairs,
     holm,
     is_majority,
+    margin,
     mean_with_interval,
     median_with_interval,
     number,
+    outcomes,
     paired_difference,
+    settling_times,
     success_rate,
     tail_mean,
 )

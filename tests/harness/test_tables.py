@@ -13,8 +13,7 @@ from rich.console import Console
 
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
-from servobench.harness.analysis.comparison import split_conditions, split_tasks
-from servobench.harness.analysis.statistics import Estimate
+from servobench.harness.analysis.comparison import Estimate, split_conditions, split_tasks
 from servobench.harness.analysis.tables import (
     Cell,
     curve_tables,

@@ -20,6 +20,7 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
+from servobench.harness.analysis.comparison import number
 from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, linear_controller, warm_up
 from servobench.harness.analysis.loops.systems import (
     POINTS,
@@ -34,7 +35,6 @@ from servobench.harness.analysis.loops.systems import (
     largest_gain,
     sensitivity,
 )
-from servobench.harness.analysis.statistics import number
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.run.loop import LoopSettings, Rollout, one_thread, periods
 from servobench.harness.run.request import RunRequest, RunSettings
