@@ -21,7 +21,7 @@ from servobench.harness.batch import results
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.run.result import RunResult
-from servobench.harness.studies.tuning.scoring import Ledger
+from servobench.harness.studies.tuning.objective import Ledger
 from servobench.plant.contract import cache as entries
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError

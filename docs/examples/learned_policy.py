@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from servobench import Command, Controller
-from servobench.harness.gym.spaces import Spaces
+from servobench.harness.gym.environment import Spaces
 
 POLICY = Path(__file__).with_name("policy.npz")
 

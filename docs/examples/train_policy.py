@@ -16,7 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from servobench.harness.gym.vector import ServoVectorEnv
+from servobench.harness.gym.environment import ServoVectorEnv
 
 LANES = 256
 ROWS = 30  # of each lane, from which the policy learns at once

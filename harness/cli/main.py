@@ -17,7 +17,6 @@ from rich.markup import escape
 from servobench.harness.cli import authoring, lists, results, runs, studies
 from servobench.harness.cli.films import record
 from servobench.harness.cli.fmu import fmu_app
-from servobench.harness.cli.loops import analyse
 from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 from servobench.plant.contract.faults import ConfigurationError
@@ -34,7 +33,7 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "First steps": (runs.run, runs.compare, results.statistics, results.report, results.figures, record),
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
-    "Studies": (studies.sweep, analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
+    "Studies": (studies.sweep, studies.analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
     "Tools": (runs.train, results.collect, runs.merge, results.export, results.verify),
 }
 

@@ -1,4 +1,4 @@
-"""The commands `servobench sweep | robustness | suite | claims | tune`: studies of many runs."""
+"""The commands `sweep | robustness | suite | claims | tune`, studies of many runs, and `analyse`, of loops."""
 
 from __future__ import annotations
 
@@ -7,16 +7,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
+import typer
+
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge, say_aids
-from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
-from servobench.plant.contract.faults import configuration_errors
+from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say, writing
+from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import pandas as pd
+
+    from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
     from servobench.harness.batch.sandbox import Workers
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.run.resolution import ResolvedRun
     from servobench.harness.studies.tuning.campaign import Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
@@ -305,3 +312,86 @@ def _print_tuned(results: Mapping[str, TunedValues]) -> None:
     for name, tuned in results.items():
         for edge in tuned.edges:
             say(f"{name}: {edge}; with these values in use the next study searches a wider box")
+
+
+TABLE = "analyse.csv"
+
+
+def analyse(
+    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
+    *,
+    mismatch: options.MismatchOption = "none",
+    seed: Annotated[int, option("INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
+    robot: options.RobotOption = "ur5",
+    jacobian: Annotated[
+        Literal["true", "nominal", "estimated"],
+        option("NAME", "Jacobian that estimators are fixed at: true, nominal or estimated."),
+    ] = "true",
+    identify: Annotated[
+        bool, switch("--identify", "Identify all loops from logged small motions, while estimators go on learning.")
+    ] = False,
+    simulate: Annotated[bool, switch("--simulate", "Also find the limits of gain and latency by simulation.")] = False,
+    overrides: options.Overrides,
+    out: Annotated[Path, option("FOLDER", "Folder for table, pictures and page.")] = Path("results") / "analyse",
+) -> None:
+    """Analyse the loop at rest: margins, Bode, Nyquist, step.
+
+    Also sensitivity, and stability over gain and latency.
+    """
+    from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
+    from servobench.harness.pictures.loops import write_pictures
+    from servobench.plant.contract.files import write_csv
+
+    runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
+    loops: list[LoopAnalysis] = []
+    for run in runs:
+        with console.status(f"analysing {run.request.controller}"):
+            try:
+                loops.append(analyse_loop(run, jacobian, identify=identify))
+            except RunFault as fault:
+                say(f"{run.request.controller}: {fault}")
+    if not loops:
+        raise ConfigurationError("no loop is left to analyse")
+    table = loop_table(loops)
+    if simulate:
+        chosen = {run.request.controller: run for run in runs}
+        with console.status("simulating"):
+            table = table.join(_simulated([chosen[loop.name] for loop in loops]))
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        write_csv(table, out / TABLE)
+        text = printed(table)
+        page = write_pictures(out, loops, text, LEGEND)[0]
+    title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
+    print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
+    say(f"table in {out / TABLE}, pictures in {page}")
+
+
+def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
+    """Return a run for each controller on the kinematic plant."""
+    from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolution import check_settings, resolve
+
+    names = selection.split("controllers", ",".join(controllers), robot=robot)
+    check_settings(settings, [PLANT, TASK, *names])
+    drawn = read_mismatch(mismatch)
+    return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]
+
+
+def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
+    """Return the simulated limits, a row for each run; NaN for a controller that is not composed."""
+    import pandas as pd
+
+    from servobench.controllers.servo import ServoController
+    from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
+
+    rows: list[tuple[float, float]] = []
+    for run in runs:
+        warm = warm_up(run)
+        if isinstance(warm.controller, ServoController):
+            loop = SmallLoop(warm)
+            rows.append((loop.gain_limit(), loop.latency_limit()))
+        else:
+            rows.append((float("nan"), float("nan")))
+    return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])

@@ -13,7 +13,7 @@ def register() -> None:
         gymnasium.register(
             ENVIRONMENT,
             entry_point="servobench.harness.gym.environment:ServoEnv",
-            vector_entry_point="servobench.harness.gym.vector:ServoVectorEnv",
+            vector_entry_point="servobench.harness.gym.environment:ServoVectorEnv",
         )
 
 

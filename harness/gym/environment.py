@@ -1,30 +1,107 @@
-"""A run as an environment of Gymnasium: the policy is the controller, everything else is the harness's."""
+"""Runs as environments of Gymnasium, alone or side by side: the policy is the controller, all else is the harness's."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, final
+from typing import Any, Final, TypeAlias, cast, final
 
 import cv2
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
-from servobench.harness.gym.spaces import Floats32, Spaces
-from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
+from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, check_possible
+from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
-from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
+from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
-from servobench.plant.contract.signals import Command, Observation
+from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
+
+Floats32: TypeAlias = npt.NDArray[np.float32]
+FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors are clipped
+
+
+@final
+class Spaces:
+    """The observation of a policy: that of every controller, and its own last action, as one vector.
+
+    | part | size | unit |
+    |---|---|---|
+    | reported joint positions | n | rad |
+    | features | m | natural size of a feature |
+    | reference minus feature, now and for each row of the preview | (1 + preview) m | the same |
+    | whether each feature was measured | m | 0 or 1 |
+    | last action | n | share of the joints' speed limits |
+
+    Positions are clipped to the joints' limits and features to ten natural sizes, so that the space is bounded.
+    """
+
+    def __init__(self, spec: PlantSpec, preview: int) -> None:
+        """Take the plant's spec and the number of future rows of the reference."""
+        self.spec = spec
+        feature = np.full(spec.m, FEATURE_BOUND)
+        error = np.full((1 + preview) * spec.m, 2 * FEATURE_BOUND)
+        ones = np.ones(spec.n)
+        lower = np.concatenate([spec.joint_lower, -feature, -error, np.zeros(spec.m), -ones])
+        upper = np.concatenate([spec.joint_upper, feature, error, np.ones(spec.m), ones])
+        self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
+        self.observations = Box(self._lower, self._upper, dtype=np.float32)
+        self.actions = Box(-1.0, 1.0, (spec.n,), np.float32)
+
+    def command(self, action: npt.ArrayLike) -> FloatArray:
+        """Return joint velocities, (..., n) rad/s, for an action, (..., n) shares of the limits; clipped to them."""
+        return np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.spec.joint_velocity_limit
+
+    def action(self, given: npt.ArrayLike, *lanes: int) -> FloatArray:
+        """Return an action as an array, (*lanes, n).
+
+        Raises:
+            ValueError: no numbers, another shape, or an entry that is not finite.
+        """
+        try:
+            numbers = np.asarray(given)
+        except ValueError:  # rows of unequal lengths
+            numbers = np.asarray(None)
+        if numbers.dtype.kind not in "fiu":
+            raise ValueError(f"action must be an array of numbers, got {given!r}")
+        return as_array("action", numbers, (*lanes, self.spec.n))
+
+    def observe(self, observation: Observation, reference: FloatArray, action: npt.ArrayLike) -> Floats32:
+        """Return the policy's observation.
+
+        Args:
+            observation: of the plant, (...).
+            reference: (..., 1 + preview, m), from now on, in the unit of the feature.
+            action: (..., n), the last one.
+
+        Returns:
+            (..., k).
+        """
+        scale, feature = self.spec.feature.scale, observation.feature
+        errors = (reference - feature[..., None, :]) / scale
+        action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+        parts = observation.joint_position, feature / scale, errors.reshape(*feature.shape[:-1], -1)
+        whole = np.concatenate([*parts, observation.valid.astype(np.float64), action], axis=-1)
+        return np.clip(whole.astype(np.float32), self._lower, self._upper)
+
+    def error(self, truth: Truth, desired: FloatArray) -> FloatArray:
+        """Return the norm of the true feature's error, (...), in natural sizes of a feature."""
+        return norm(desired - truth.feature) / self.spec.feature.scale
+
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none
 PLACEHOLDER: Final = "constant"  # the harness builds every run with a controller; this one costs least
@@ -250,3 +327,132 @@ class OutsideScene:
     def close(self) -> None:
         """Leave the scene."""
         self._scene.close()
+
+
+@final
+class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
+    """Many runs of a task that advance together, each with a robot, a target and noise of its own.
+
+    A lane is the same run, to the bit, as a `ServoEnv` with its seed. All episodes have the same length and are reset
+    together: if a run fails, it is terminated and the others are truncated. The step after the end resets all lanes and
+    ignores the actions, as Gymnasium's own vector environments do.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        **choice: Any,  # noqa: ANN401 - typed by `ServoEnv`
+    ) -> None:
+        """Look everything up.
+
+        Args:
+            num_envs: number of lanes.
+            choice: arguments of `ServoEnv`, which all runs share.
+
+        Raises:
+            ConfigurationError: a number, name, setting or mismatch that cannot be used, or a plant that carries out
+                one run at a time.
+        """
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ConfigurationError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
+        if choice.get("render_mode") is not None:
+            raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
+        single = ServoEnv(**choice)
+        single.close()
+        self._resolved = single.resolved
+        if side_by_side_key(self._resolved) is None:
+            raise ConfigurationError(
+                f"plant {self._resolved.request.plant} carries out one run at a time: "
+                "gymnasium.make_vec(..., vectorization_mode='async')"
+            )
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._many: Experiment | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats32, dict[str, Any]]:
+        """Begin a run in every lane.
+
+        Args:
+            seed: of the first lane, from which the others count on, or one of each lane; None draws one.
+            options: there are none.
+
+        Returns:
+            The observations of the policies, (num_envs, k), and `seed`, (num_envs,).
+
+        Raises:
+            ConfigurationError: options are given, a seed above 2⁶³ − num_envs, or a list of seeds of another length.
+        """
+        check_options(options)
+        count = self.num_envs
+        listed: list[int | None] | None = None
+        if isinstance(seed, list | tuple | np.ndarray):
+            listed = [None if each is None else read_seed(each) for each in seed]
+        if listed is not None and len(listed) != count:
+            raise ConfigurationError(f"seed must be a number or a list of {count}, got {len(listed)} seeds")
+        first = cast("int | None", seed if listed is None else listed[0])
+        super().reset(seed=first)
+        if first is not None and first > 2**63 - count:
+            raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
+        seeds = self.np_random.integers(SEEDS, size=count) if first is None or listed else first + np.arange(count)
+        if listed is not None:
+            pairs = zip(listed, seeds.tolist(), strict=True)
+            seeds = np.array([drawn if each is None else each for each, drawn in pairs])
+        self.close_extras()
+        self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
+        bench = self._bench = cast(Bench, many.plant)
+        self._spaces = Spaces(bench.spec, many.loop.preview)
+        self._ended = False
+        self._action: FloatArray = np.zeros((self.num_envs, bench.spec.n))
+        observation = bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
+        self._rollout = Rollout(bench, observation, many.desired(many.periods + 1), many.loop)  # also after the last
+        return self._observe(), {"seed": seeds}
+
+    def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Hold an action in every lane for a period; see `ServoEnv.step`.
+
+        Args:
+            actions: (num_envs, n).
+
+        Raises:
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+            ValueError: actions that are not (num_envs, n) finite numbers.
+        """
+        many = self._many
+        if many is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        if self._ended:
+            none = np.zeros(self.num_envs, dtype=np.bool_)
+            observed, info = self.reset()
+            return observed, np.zeros(self.num_envs), none, none.copy(), info
+        self._action = self._spaces.action(actions, self.num_envs)
+        rollout = self._rollout
+        rollout.advance(Command(self._spaces.command(self._action)))
+        lost = rollout.lost()
+        failed = np.zeros(self.num_envs, dtype=np.bool_) if lost is None else lost
+        failed[list(self._bench.faults)] = True
+        error = self._spaces.error(self._bench.truth(), rollout.reference[:, 0])
+        self._ended = not rollout.running or bool(failed.any())
+        period = self._spaces.spec.period
+        periods = np.where(failed, many.periods - rollout.k + 1, 1)
+        info = {"time": rollout.k * period, "error": error}
+        return self._observe(), -error * periods * period, failed, ~failed & self._ended, info
+
+    @property
+    def observation(self) -> Observation:
+        """The present observation of the plant, as controllers get it; arrays have a leading axis."""
+        return self._rollout.observation
+
+    def _observe(self) -> Floats32:
+        return self._spaces.observe(self._rollout.observation, self._rollout.reference, self._action)
+
+    def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
+        """Free the plant."""
+        if self._many is not None:
+            self._many.plant.close()
+            self._many = None

@@ -33,13 +33,14 @@ from servobench.harness.studies.tuning.objective import (
     run_cost,
     score,
 )
-from servobench.harness.studies.tuning.search import first_points, inside
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
     edges,
     find_space,
     find_tunable,
+    first_points,
+    inside,
     is_switch,
     nested_settings,
     values_of,

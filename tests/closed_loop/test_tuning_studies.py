@@ -13,18 +13,19 @@ from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, r
 from servobench import controllers
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods, write_results, write_tuned
-from servobench.harness.studies.tuning.objective import WORST, TuningSet, score
-from servobench.harness.studies.tuning.scoring import Ledger, fill, open_ledger
-from servobench.harness.studies.tuning.search import (
+from servobench.harness.studies.tuning.objective import WORST, Ledger, TuningSet, fill, open_ledger, score
+from servobench.harness.studies.tuning.spaces import (
     ACCEPTED,
     StudyRecord,
     changes,
     coordinate_search,
+    default_values,
+    find_tunable,
     first_points,
     neighbours,
+    nested_settings,
     tuned_point,
 )
-from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 from servobench.plant.contract.faults import ConfigurationError
 
 TUNED = Path(controllers.__file__).parent / "tuned" / "constant.toml"

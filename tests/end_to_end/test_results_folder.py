@@ -19,7 +19,7 @@ from servobench.harness.batch import campaign, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.studies.tuning.scoring import Ledger
+from servobench.harness.studies.tuning.objective import Ledger
 from servobench.plant.contract.faults import ConfigurationError
 
 SWEEP = (

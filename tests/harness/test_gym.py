@@ -13,8 +13,7 @@ from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
 from servobench.harness.config.registry import RENDERED, default_plant
 from servobench.harness.gym import ENVIRONMENT
-from servobench.harness.gym.environment import MARK, ServoEnv
-from servobench.harness.gym.vector import ServoVectorEnv
+from servobench.harness.gym.environment import MARK, ServoEnv, ServoVectorEnv
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.rendered.room import Overview
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from servobench.harness.batch.blocks import open_workers
 from servobench.harness.config.settings import flatten
-from servobench.harness.studies.tuning import scoring
+from servobench.harness.studies.tuning import objective as scoring
 from servobench.harness.studies.tuning.campaign import TunedValues, TuningPlan, advance, open_methods
 from servobench.harness.studies.tuning.objective import TuningSet
-from servobench.harness.studies.tuning.search import StudyRecord
+from servobench.harness.studies.tuning.spaces import StudyRecord
 
 SMALL = TuningSet(robots=2)
 

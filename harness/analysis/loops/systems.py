@@ -24,7 +24,7 @@ and, for channels that change each by itself, with S = (I + L)⁻¹ and T = L S,
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -54,17 +54,11 @@ class StateSpace(NamedTuple):
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
         return np.asarray(self.C @ np.linalg.solve(resolvent, self.B.astype(np.complex128)) + self.D)
 
-    def as_control(self, period: float) -> Any:  # noqa: ANN401 - python-control has no types
-        """Return the system as a `control.StateSpace` with the sampling period [s]."""
-        import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
-
-        return control.ss(*self, period)
-
     def step(self, outputs: int, period: float, periods: int) -> FloatArray:
         """Return each of the first outputs after a unit step of the input with its number, (periods, outputs)."""
-        import control  # noqa: PLC0415 - as above
+        import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
 
-        system, times = self.as_control(period), np.arange(periods) * period
+        system, times = control.ss(*self, period), np.arange(periods) * period
         steps = [control.step_response(system, times, input=i, output=i).outputs for i in range(outputs)]
         return np.stack([np.ravel(step) for step in steps], axis=-1)
 

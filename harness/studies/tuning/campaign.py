@@ -23,24 +23,29 @@ from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.description import toml
 from servobench.harness.config.settings import default_config, file_stem, flatten
-from servobench.harness.studies.tuning.objective import TuningSet, score
-from servobench.harness.studies.tuning.scoring import (
+from servobench.harness.studies.tuning.objective import (
     LEDGER,
     SECOND,
     Ledger,
+    TuningSet,
     Wanted,
     fill,
     open_ledger,
     refuse_broken_defaults,
+    score,
 )
-from servobench.harness.studies.tuning.search import StudyRecord, first_points, neighbours, study, tuned_point
 from servobench.harness.studies.tuning.spaces import (
     Point,
+    StudyRecord,
     default_values,
     edges,
     find_space,
     find_tunable,
+    first_points,
+    neighbours,
     nested_settings,
+    study,
+    tuned_point,
     values_of,
 )
 from servobench.plant.contract.faults import ConfigurationError

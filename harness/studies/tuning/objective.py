@@ -1,4 +1,4 @@
-"""The objective of tuning, and the runs on which it is measured.
+"""The objective of tuning, the runs on which it is measured, and the ledgers that keep the scores of points.
 
 For each plant, `robots` runs in each of eight worlds: a task at a control rate, of `KINDS`, with one level of each of
 `LEVELS`. Every run has a robot of its own with one of `MODELS`. Levels and models occur equally often, as far as their
@@ -15,24 +15,35 @@ number allows, in an order that the set's seed draws: nobody chooses which meet,
 Errors e below the floor of 1.5 mm cost nothing, and above 1 m all the same. The cost is continuous in the error: a run
 that leaves the settling band late costs hardly more than one that does not. Each instant of a move counts alike, so the
 cost of an approach grows in proportion to its settling time. A curve's cost is the logarithm of its judged error.
+Points whose settings cannot be built, or whose loop is too close to instability, have the worst cost without a run.
+
+A ledger is a file that a killed process leaves readable. Each line is a JSON object: the first one holds everything
+that scores depend on besides the settings, each other one the settings of a point and the cost of every run.
 """
 
+import json
 import math
+import os
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, Self, TypeAlias
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self, TypeAlias, final
 
 import numpy as np
 
+from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.config.settings import Settings, apply_settings, default_config, file_stem, flatten
+from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
-from servobench.harness.run.request import RunRequest, Varied, read_mismatch
+from servobench.harness.run.request import RunRequest, RunSettings, Varied, read_mismatch
 from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.studies.tuning.spaces import find_tunable
+from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, Periods, settings
@@ -194,3 +205,178 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Worke
         for job, result in zip(block.jobs, outcome, strict=True):
             _, t, r, _ = order[job.index]
             yield t, r, run_cost(runs[r].task, result.row)
+
+
+SECOND: Final = ".second"  # of the name of the ledger of the second set
+Wanted: TypeAlias = tuple["Ledger", str, Mapping[str, Any]]
+"""A point whose costs are wanted: the ledger that takes them, the controller, its nested settings."""
+LEDGER: Final = ".jsonl"
+SHOWN: Final = 60  # letters of wrong costs that a message holds
+
+
+@final
+class Ledger:
+    """Costs by settings, each written down as soon as it is known."""
+
+    def __init__(self, path: Path, fingerprint: Mapping[str, Any]) -> None:
+        """Open a ledger, or prepare one where there is none; its file is made with the first point.
+
+        Args:
+            path: of the file.
+            fingerprint: all that costs depend on besides the settings, as JSON has it.
+
+        Raises:
+            ConfigurationError: the file is no ledger, or that of something else.
+        """
+        self.path = path
+        self._fingerprint = dict(fingerprint)
+        self._costs: dict[str, list[float]] = {}
+        self._size = 0  # [bytes] of its whole lines: a process that is killed or interrupted may leave half a line
+        if path.is_file():
+            self._read()
+
+    def _read(self) -> None:
+        wrong = OSError, KeyError, TypeError, OverflowError, RecursionError
+        with configuration_errors(f"study {self.path} cannot be opened: ", *wrong):
+            content = self.path.read_bytes()
+            self._size = content.rfind(b"\n") + 1
+            header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
+            self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
+        parts = [key for key in self._fingerprint if not isinstance(header, dict)
+                 or header.get(key) != self._fingerprint[key]]  # fmt: skip
+        if parts:
+            raise ConfigurationError(
+                f"study {self.path} was made with other {', '.join(parts)}; name another folder with --out"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of scored points."""
+        return len(self._costs)
+
+    def best(self) -> float | None:
+        """Return the least mean cost, or None while there is none."""
+        return min((sum(costs) / len(costs) for costs in self._costs.values()), default=None)
+
+    def costs(self, settings: Mapping[str, Any]) -> list[float] | None:
+        """Return the costs of the runs under nested settings, or None if they are not known."""
+        return self._costs.get(_key(settings))
+
+    def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
+        """Write the costs of the runs under nested settings down."""
+        lines = [self._fingerprint] * (not self._size) + [{"settings": settings, "costs": list(costs)}]
+        try:
+            with self.path.open("ab") as file:
+                file.truncate(self._size)
+                file.write("".join(f"{json.dumps(line)}\n" for line in lines).encode())
+                file.flush()
+                os.fsync(file.fileno())
+                self._size = file.tell()
+        except OSError as error:
+            raise ConfigurationError(f"study {self.path} cannot be written: {error.strerror}") from error
+        self._costs[_key(settings)] = list(costs)
+
+
+def _costs(given: object) -> list[float]:
+    """Return the costs of a record.
+
+    Raises:
+        ValueError: they are no numbers.
+    """
+    if not isinstance(given, list) or not given or not all(type(each) in (int, float) for each in given):
+        raise ValueError(f"costs must be a list of numbers, got {str(given)[:SHOWN]}")
+    return [float(each) for each in given]
+
+
+def _key(settings: Mapping[str, Any]) -> str:
+    return json.dumps(settings, sort_keys=True)
+
+
+def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") -> Ledger:
+    """Return the ledger of a controller on a set of runs.
+
+    Raises:
+        ConfigurationError: the file is no ledger, or one of other settings or runs.
+    """
+    return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint(controller, runs))
+
+
+def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
+    """Return everything except the settings on which costs depend, as JSON."""
+    constants = {
+        "KINDS": KINDS, "LEVELS": LEVELS, "MODELS": MODELS, "TASKS": TASKS, "FLOOR": FLOOR,
+        "MIN_DELAY_MARGIN": MIN_DELAY_MARGIN, "WORST": WORST,
+    }  # fmt: skip
+    return {
+        "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
+        "objective": {name: repr(value) for name, value in constants.items()},
+        "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
+        "plants": list(runs.plants),
+        "robots": [runs.robots, runs.offset],
+    }
+
+
+def refuse_broken_defaults(controller: str, runs: TuningSet) -> None:
+    """Build the first run with the settings in use: an error that no setting can cure is reported before any run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used.
+    """
+    reason = refusal(Trial(controller, default_config(find_tunable(controller))), runs)
+    if reason is not None:
+        raise ConfigurationError(reason)
+
+
+def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
+    """Score the points that their ledgers lack, each once, and yield the controller of each as soon as it is written.
+
+    Settings that cannot be built or whose loop bears no delay have the worst cost in every run, without a run.
+    """
+    requests = runs.runs()
+    lacking: dict[str, tuple[Ledger, Trial, Mapping[str, Any]]] = {}
+    for ledger, name, nested in wanted:
+        if ledger.costs(nested) is not None or f"{name}{nested}" in lacking:
+            continue
+        try:
+            trial = Trial(name, apply_settings(find_tunable(name), nested))
+            refused = refusal(trial, runs) is not None or not bears_delay(trial)
+        except ConfigurationError:
+            refused = True
+        if refused:
+            ledger.add(nested, [WEIGHTS[run.task] * WORST for run in requests])
+            yield name
+        else:
+            lacking[f"{name}{nested}"] = ledger, trial, nested
+    points = list(lacking.values())
+    costs = np.full((len(points), len(requests)), np.nan)
+    for point_index, run_index, cost in evaluate([trial for _, trial, _ in points], requests, workers):
+        costs[point_index, run_index] = cost
+        if not np.isnan(costs[point_index]).any():
+            ledger, trial, nested = points[point_index]
+            ledger.add(nested, costs[point_index].tolist())
+            yield trial.controller
+
+
+def refusal(trial: Trial, runs: TuningSet) -> str | None:
+    """Return why a run with these settings cannot be built, or None; networks are trained before workers need them.
+
+    Any other failure is left to the runs, whose cost says so.
+    """
+    try:
+        build_once(trial.resolved(runs.runs()[:1])[0])
+    except ConfigurationError as error:
+        return str(error)
+    return None
+
+
+def bears_delay(trial: Trial) -> bool:
+    """Return whether the loop of a composed controller has the least delay margin, `MIN_DELAY_MARGIN`.
+
+    A controller that identifies the delay changes its loop with it and is left to the runs; so is one whose loop cannot
+    be analysed.
+    """
+    if trial.config.aids.delay == "identified":
+        return True
+    try:
+        return delay_margin(trial.config, trial.controller) >= MIN_DELAY_MARGIN
+    except (ArithmeticError, ValueError, RunFault):  # it fails in the runs, too, whose cost says so
+        return True
