@@ -38,10 +38,9 @@ from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
 from servobench.harness.cli.selection import split
-from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
-from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.request import RunRequest, find_robot, read_mismatch
 from servobench.harness.run.resolution import check_settings, resolve
 from servobench.plant.contract import checksums
 from servobench.plant.contract.faults import ConfigurationError

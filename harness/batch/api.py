@@ -16,10 +16,9 @@ from servobench.harness.batch.campaign import Campaign, Execution, carry_out, co
 from servobench.harness.batch.plan import Batch, Cell, Grid
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
-from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolution import check_settings
 from servobench.harness.run.result import RunResult
 from servobench.harness.run.tasks import choose_task

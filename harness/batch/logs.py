@@ -9,9 +9,8 @@ import pandas as pd
 
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
-from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings, nest
-from servobench.harness.run.request import RunRequest, varied_in_row
+from servobench.harness.run.request import OWN_ROBOT, RunRequest, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table

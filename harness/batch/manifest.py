@@ -12,9 +12,9 @@ from typing import Any, Final
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import git_commit, installed_version
 from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
-from servobench.harness.config.robots import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
+from servobench.harness.run.request import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path

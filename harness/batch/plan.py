@@ -21,8 +21,7 @@ from typing import Any, Final, Generic, Self, TypeVar, overload
 import numpy as np
 
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.run.request import SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
+from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.units import split_quantity

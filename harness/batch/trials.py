@@ -18,11 +18,10 @@ from servobench.harness.batch.processes import FOREIGN_TIME, Bounds
 from servobench.harness.batch.sandbox import LOST, Tell, call
 from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, Registry, find_controller, installed_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import PLACE, count_as_users, place_in_trace
 from servobench.harness.run.experiment import build
-from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, find_robot, read_mismatch
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.harness.run.tasks import task_names

@@ -65,7 +65,7 @@ def tasks(
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
-    from servobench.harness.config.robots import find_robot
+    from servobench.harness.run.request import find_robot
     from servobench.harness.run.tasks import choose_task, find_task, fitted, task_names
 
     if name:

@@ -110,7 +110,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         from servobench.harness.config.registry import offering
 
         if (camera := values.pop("camera", None)) is not None:
-            from servobench.harness.config.robots import DEFAULT_ROBOT, with_camera
+            from servobench.harness.run.request import DEFAULT_ROBOT, with_camera
 
             values["robot"] = with_camera(values["robot"] or DEFAULT_ROBOT, camera)
         for name, group in groups.items():

@@ -81,7 +81,7 @@ def _mismatches() -> Names:
 
 
 def _robots() -> Names:
-    from servobench.harness.config.robots import find_robot
+    from servobench.harness.run.request import find_robot
     from servobench.plant.robot.catalogue import ROBOTS
 
     def find(word: str) -> str:
@@ -93,7 +93,7 @@ def _robots() -> Names:
 
 
 def _sensings() -> Names:
-    from servobench.harness.config.robots import find_sensing, sensing_names
+    from servobench.harness.run.request import find_sensing, sensing_names
 
     return Names(sensing_names, find_sensing)
 

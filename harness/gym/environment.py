@@ -13,12 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.registry import rendered_plant, scene_of
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, check_possible
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.loop import Rollout
-from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, find_robot, read_mismatch, read_seed
 from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.bench.bench import Bench
 from servobench.plant.cameras.registry import DEFAULT_SENSING

@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.installation import missing_extra
-from servobench.harness.config.robots import DEFAULT_ROBOT, short_name
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
+from servobench.harness.run.request import DEFAULT_ROBOT, short_name
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.rendered.detection import ByteArray

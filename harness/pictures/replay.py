@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.registry import rendered_plant, scene_of
-from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.pictures.tracks import Track, track_of, values_drawn
+from servobench.harness.run.request import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors

@@ -23,13 +23,12 @@ from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
-from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import NARROW, WIDE, Drawing, MethodStyle, drawing_of, method_styles
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, load_tables, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
-from servobench.harness.run.request import varied_columns
+from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from servobench.controllers.servo import ServoController
 from servobench.harness.config.registry import engine_of
-from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw
@@ -21,7 +20,7 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.outcome import final_means, find_outcome, pose_errors
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import OWN_ROBOT, RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
 from servobench.plant.bench.bench import Bench

@@ -17,11 +17,17 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing, sensing_file
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.request import (
+    DEFAULT_ROBOT,
+    RunRequest,
+    RunSettings,
+    find_robot,
+    find_sensing,
+    sensing_file,
+)
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting

@@ -28,11 +28,10 @@ from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
 from servobench.harness.run.loop import LoopSettings, begin, periods
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, find_robot
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray

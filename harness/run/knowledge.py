@@ -11,9 +11,9 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
-from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunSettings
 from servobench.plant.contract.cache import cache_folder, cached
+from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot

@@ -7,7 +7,6 @@ Times are wall clock and the only columns that differ between two runs of the sa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
@@ -19,13 +18,10 @@ from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.lanes import norm
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, column_names
 
 if TYPE_CHECKING:
     import pandas as pd
-
-JOINT_UNIT = "rad"
-COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,19 +179,6 @@ class StepLog:
         k, rows = self._count, self._rows
         arrays = {item.name: getattr(rows, item.name)[:k] for item in fields(rows)[1:-1]}
         return Steps(rows.spec, **arrays, diagnostics={name: values[:k] for name, values in rows.diagnostics.items()})
-
-
-def column_names(spec: PlantSpec) -> dict[str, list[str]]:
-    """Return the names of columns, such as `feature_x_m`, by kind in the order of the table of steps."""
-    features, joints = (spec.feature_names, spec.feature_unit), (spec.joint_names, JOINT_UNIT)
-    kinds = {"reference": features, "feature": features, "true_feature": features, "joint_position": joints,
-             COMMAND: (spec.joint_names, spec.command.unit)}  # fmt: skip
-    return {kind: [f"{kind}_{name}_{column_unit(unit)}" for name in names] for kind, (names, unit) in kinds.items()}
-
-
-def column_unit(unit: str) -> str:
-    """Return a unit as the names of columns end with it: `rad/s` -> `rad_s`."""
-    return re.sub(r"\W+", "_", unit)
 
 
 def flat(values: FloatArray) -> FloatArray:

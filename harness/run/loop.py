@@ -13,24 +13,22 @@ an error (`careful`).
 
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import ThreadpoolController
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import StepLog
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.seeds import Seeds, named_seed
 from servobench.plant.contract.signals import Command, Observation, Truth
-
-_found: list[tuple[int, ThreadpoolController]] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,18 +169,6 @@ def begin(
 
 def _named(seed: Seeds, name: str) -> Any:  # noqa: ANN401 - as `seed`
     return named_seed(seed, name) if isinstance(seed, int) else [named_seed(each, name) for each in seed]
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Return a context in which linear algebra runs on one thread.
-
-    The search for libraries takes milliseconds, so it is repeated only if a module was imported since the last one.
-    """
-    modules = len(sys.modules)
-    if not _found or _found[0][0] != modules:
-        _found[:] = [(modules, ThreadpoolController())]
-    context: AbstractContextManager[object] = _found[0][1].limit(limits=1)
-    return context
 
 
 @contextmanager

@@ -19,12 +19,11 @@ from typing import Final, Literal, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.harness.run.log import column_unit
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
-from servobench.plant.contract.signals import Channel
+from servobench.plant.contract.signals import Channel, column_unit
 from servobench.plant.robot.camera import CAMERA
 from servobench.plant.robot.robot import Robot
 

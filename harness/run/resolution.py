@@ -12,9 +12,8 @@ from servobench.harness.config.registry import (
     is_foreign_controller,
     plant_names,
 )
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import Settings, default_config, nest
-from servobench.harness.run.request import RunRequest, RunSettings, Varied
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied, find_robot
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry

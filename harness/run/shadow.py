@@ -13,7 +13,7 @@ import pandas as pd
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
-from servobench.harness.run.log import COMMAND, StepLog, column_names
+from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import LoopSettings, careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.settings import remark
-from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.signals import COMMAND, Command, Observation, PlantSpec, Truth, column_names
 from servobench.plant.robot.hand_eye import RobotModel
 
 LOG: Final = "the log"  # in error messages

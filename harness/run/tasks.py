@@ -16,8 +16,8 @@ import numpy as np
 
 from servobench.harness.config.entries import Kind, check_settings, summary_of
 from servobench.harness.config.registry import Registry
-from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
+from servobench.harness.run.request import DEFAULT_ROBOT
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.setups import SetupModel

@@ -25,10 +25,9 @@ from typing import Any, Final, Literal, NamedTuple
 
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, with_camera
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import draw
-from servobench.harness.run.request import SHORT_NAMES
+from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, with_camera
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import choose_task
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors

@@ -27,11 +27,10 @@ from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError

@@ -10,18 +10,22 @@ are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over th
 """
 
 import math
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields, is_dataclass
 from functools import cache, wraps
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import ThreadpoolController
 
 from servobench.plant.contract.checks import FloatArray
 
 Tree = TypeVar("Tree")
 Lanes = Any  # an index of the leading axes
+_found: list[tuple[int, ThreadpoolController]] = []
 
 
 def map_arrays(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
@@ -179,3 +183,15 @@ def _identity(size: int) -> FloatArray:
 def transposed(A: npt.NDArray[Any]) -> FloatArray:
     """Return Aᵀ, (..., n, m), for A (..., m, n)."""
     return A.mT
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Return a context in which linear algebra runs on one thread.
+
+    The search for libraries takes milliseconds, so it is repeated only if a module was imported since the last one.
+    """
+    modules = len(sys.modules)
+    if not _found or _found[0][0] != modules:
+        _found[:] = [(modules, ThreadpoolController())]
+    context: AbstractContextManager[object] = _found[0][1].limit(limits=1)
+    return context

@@ -6,6 +6,7 @@ command of instant t_k; the command acts on [t_k, t_{k+1}).
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -15,6 +16,8 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray, as_vector, is_finite, real_numbers
 
 BoolArray = npt.NDArray[np.bool_]
+JOINT_UNIT = "rad"
+COMMAND = "joint_velocity_command"  # begin of the names of columns with commands
 SETTLING_BAND = 0.005  # share of a feature's natural size: 5 mm on the UR5
 
 
@@ -248,3 +251,16 @@ _new = object.__new__
 _set_time, _set_joints, _set_feature, _set_feature_valid, _set_valid = (
     getattr(Observation, name).__set__ for name in ("time", "joint_position", "feature", "feature_valid", "valid")
 )
+
+
+def column_names(spec: PlantSpec) -> dict[str, list[str]]:
+    """Return the names of columns, such as `feature_x_m`, by kind in the order of the table of steps."""
+    features, joints = (spec.feature_names, spec.feature_unit), (spec.joint_names, JOINT_UNIT)
+    kinds = {"reference": features, "feature": features, "true_feature": features, "joint_position": joints,
+             COMMAND: (spec.joint_names, spec.command.unit)}  # fmt: skip
+    return {kind: [f"{kind}_{name}_{column_unit(unit)}" for name in names] for kind, (names, unit) in kinds.items()}
+
+
+def column_unit(unit: str) -> str:
+    """Return a unit as the names of columns end with it: `rad/s` -> `rad_s`."""
+    return re.sub(r"\W+", "_", unit)

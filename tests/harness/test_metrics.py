@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from kit.straight_move import CONDITION, SPEC, VELOCITY, straight_move
-from servobench.harness.run.log import StepLog, column_unit
+from servobench.harness.run.log import StepLog
 from servobench.harness.run.metrics import judge_run, overshoot, path_length, settling_time, sign_switches
+from servobench.plant.contract.signals import column_unit
 
 PERIOD = 0.1
 

@@ -16,14 +16,13 @@ from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_sensing, named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.robots import find_sensing, sensing_names
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.references import FollowedCurve
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, find_sensing, sensing_names
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench

@@ -24,9 +24,9 @@ from servobench.controllers.controller import Controller, JacobianFunction
 from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.analysis.loops.systems import ArmModel, StateSpace
-from servobench.harness.config.robots import find_robot
 from servobench.harness.run.experiment import build
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
+from servobench.harness.run.request import find_robot
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray

@@ -35,14 +35,14 @@ from servobench.harness.analysis.loops.systems import (
     largest_gain,
     sensitivity,
 )
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.run.loop import LoopSettings, Rollout, one_thread, periods
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.loop import LoopSettings, Rollout, periods
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, find_robot
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import fitted
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged, RunFault
+from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.signals import Command, Observation, Truth
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
