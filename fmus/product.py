@@ -5,7 +5,6 @@ Equal inputs give equal bytes: no date, no path and no machine name enters the a
 
 import hashlib
 import html
-import os
 import re
 import string
 import tempfile
@@ -28,7 +27,7 @@ from servobench.fmus.model_description import (
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.fmus.sources import layout_header
 from servobench.fmus.variables import Layout
-from servobench.plant.contract.files import reason
+from servobench.plant.contract.files import reason, write_atomically
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
 HEADERS: Final = {
@@ -195,20 +194,16 @@ def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "model
     Raises:
         ValueError: the folder does not exist, or takes no file.
     """
-    try:
-        handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written: {reason(error)}") from error
-    try:
-        with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
+
+    def write(partial: Path) -> None:
+        with zipfile.ZipFile(partial, "w") as archive:
             for inside in sorted(contents, key=lambda name: (name != first, name)):
                 entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
                 entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
                 entry.external_attr = 0o644 << 16
                 archive.writestr(entry, contents[inside], compresslevel=9)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
+
+    try:
+        write_atomically(path, write)
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {reason(error)}") from error
-    finally:
-        Path(name).unlink(missing_ok=True)

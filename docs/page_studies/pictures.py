@@ -33,7 +33,7 @@ def readme_pictures(folder: Path) -> dict[str, bytes]:
     batch = folder / "batch"
     runs = results.load_runs(batch)
     row = {str(name): value for name, value in runs[runs["task"] == SHOWN].iloc[0].items()}
-    frame = draw_frame(logged_run(row, results.load_steps(batch, [row["run_id"]]), {}), PERIOD)
+    frame = draw_frame(logged_run(row, results.load_steps(batch, [row["run_id"]])), PERIOD)
     figures = {
         f"pictures/{FILES[named.kind]}.png": b64decode(drawing_of(named.figure).data)
         for named in folder_figures(batch)

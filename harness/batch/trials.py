@@ -57,21 +57,6 @@ class Tried:
     fault: str = ""
 
 
-@dataclass
-class Outcome:
-    """The outcome of code of a user in a sandbox.
-
-    Attributes:
-        answer: of the function; None where it gave none.
-        refusal: its `ConfigurationError`, in one line.
-        failure: why it did not return, in one line.
-    """
-
-    answer: Any = None
-    refusal: str = ""
-    failure: str = ""
-
-
 class _Trains(BaseException):
     """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
 
@@ -96,7 +81,7 @@ def attempt(
     why: Callable[[Ending, float], str] = explain,
     hear: Tell = lambda _: None,
     quiet: bool = True,
-) -> Outcome:
+) -> tuple[Any, str]:
     """Call a function with code of users in a sandbox.
 
     Args:
@@ -106,20 +91,26 @@ def attempt(
         why: says why the function did not return, from the end of its process.
         hear: receives the values that the function passes to `tell`.
         quiet: discard the output; where it is wanted, the code is called a second time.
+
+    Returns:
+        Its answer, None where it gave none, and why it did not return, in one line; empty if it did.
+
+    Raises:
+        ConfigurationError: that of the function.
     """
-    outcome = Outcome()
+    found: dict[str, Any] = {}
 
     def receive(message: object) -> None:
         match message:
             case ["told", told]:
                 hear(told)
-            case ["answer" | "refusal" | "failure" as field, value]:
-                setattr(outcome, field, value if field == "answer" else str(value))
+            case ["answer" | "refusal" | "failure" as part, value]:
+                found[part] = value
 
     end = call(_attempt_here, (function, arguments, quiet), Bounds(limit).limits(1, foreign=True), receive)
-    if end is not None:
-        outcome.failure = why(end, limit)
-    return outcome
+    if "refusal" in found:
+        raise ConfigurationError(str(found["refusal"]))
+    return found.get("answer"), str(found.get("failure", "")) if end is None else why(end, limit)
 
 
 def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool], tell: Tell) -> None:
@@ -148,9 +139,9 @@ def choose(word: Word, given: str) -> str:
     """
     registry = REGISTRIES[word]
     if _is_foreign(registry, given):
-        found = attempt(_choose, word, given, limit=IMPORT_LIMIT)
-        if found.refusal or found.failure:
-            raise ConfigurationError(found.refusal or f"{given} cannot be imported: {found.failure}")
+        _, failure = attempt(_choose, word, given, limit=IMPORT_LIMIT)
+        if failure:
+            raise ConfigurationError(f"{given} cannot be imported: {failure}")
     return registry.choose(given)
 
 
@@ -182,12 +173,15 @@ def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
 
 def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
     """Try one in a sandbox."""
-    found = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT)
-    match found.answer:
+    try:
+        answer, why = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT)
+    except ConfigurationError as error:  # which such code may falsify
+        answer, why = None, str(error)
+    match answer:
         case [str(summary), str(fault)]:
             return Tried(point.name, summary, fault)
-    failure = found.failure or "it gave no answer"
-    return Tried(point.name, fault=f"{word} {point.name!r} ({point.value}) cannot be used: {failure}")
+    why = why or "it gave no answer"
+    return Tried(point.name, fault=f"{word} {point.name!r} ({point.value}) cannot be used: {why}")
 
 
 def _try_there(_tell: Tell, word: Word, name: str, robot: str) -> tuple[str, str]:
@@ -230,11 +224,9 @@ def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Findi
             case str(check):
                 current.append(check)
 
-    found = attempt(_check, checks, subject, limit=limit, hear=receive)
-    if found.refusal:
-        raise ConfigurationError(found.refusal)
-    if found.failure:
-        hear(Finding(current[-1], "failed", found.failure))
+    _, failure = attempt(_check, checks, subject, limit=limit, hear=receive)
+    if failure:
+        hear(Finding(current[-1], "failed", failure))
 
 
 def _check(tell: Tell, checks: Checks, subject: str) -> None:
@@ -249,13 +241,11 @@ def validate(path: Path) -> Validation:
     """
     from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
 
-    found = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
-    if found.refusal:
-        raise ConfigurationError(found.refusal)
-    match found.answer:
+    answer, failure = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
+    match answer:
         case [list(problems), float() | None as deviation]:
             return Validation(tuple(map(str, problems)), deviation)
-    return Validation((f"the reference run ended: {found.failure or 'it gave no answer'}",), None)
+    return Validation((f"the reference run ended: {failure or 'it gave no answer'}",), None)
 
 
 def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:

@@ -132,28 +132,23 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logs import find_run
-    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.pictures.replay import logged_run
 
     row = find_run(folder, run_id)
-    settings = results.read_manifest(folder).get("configuration", {}).get(rendered_plant(row["plant"]), {})
-    return logged_run(row, results.load_steps(folder, [row["run_id"]]), settings)
+    return logged_run(row, results.load_steps(folder, [row["run_id"]]))
 
 
 def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.config.registry import rendered_plant
-    from servobench.harness.config.settings import flatten, read_settings
+    from servobench.harness.config.settings import read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolution import check_settings
-    from servobench.plant.rendered.settings import RenderedConfig
 
     names, settings = new.names(), read_settings(new.config, new.set_ or [])
     chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
     request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
-    shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))
-    return logged_run(result.row, result.steps, shown_as)
+    return logged_run(result.row, result.steps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.cli.terminal import say
 from servobench.plant.contract.faults import ConfigurationError
@@ -35,80 +35,69 @@ class Names(NamedTuple):
 
 @cache
 def names_of(kind: str) -> Names:
-    """Return the names of a kind: plants, controllers, estimators, tasks, challenges and so on."""
-    return KINDS[kind]()  # which imports no more than its kind needs, as shells wait for completions
+    """Return the names of a kind: plants, controllers, estimators, tasks, challenges and so on.
+
+    It imports no more than its kind needs, as shells wait for completions.
+    """
+    match kind:
+        case "plants":
+            from servobench.harness.config.registry import plant_names
+
+            return Names(plant_names, partial(_choose, "plant"), "plant")
+        case "controllers":
+            from servobench.harness.config.registry import controller_names
+
+            return Names(controller_names, partial(_choose, "controller"), "controller", _begun_controllers)
+        case "estimators":
+            from servobench.controllers.methods import ESTIMATORS
+
+            return Names(lambda: list(ESTIMATORS), str)
+        case "tasks":
+            from servobench.harness.run.tasks import choose_task, task_names
+
+            return Names(task_names, choose_task)
+        case "mismatch":
+            from servobench.harness.run.request import read_mismatch
+            from servobench.plant.robot.mismatch import PROFILES
+
+            return Names(lambda: list(PROFILES), read_mismatch, begun=_begun_mismatches)
+        case "robot":
+            from servobench.plant.robot.catalogue import ROBOTS
+
+            return Names(lambda: list(ROBOTS), _find_robot)
+        case "sensing":
+            from servobench.harness.run.request import find_sensing, sensing_names
+
+            return Names(sensing_names, find_sensing)
+        case "challenges":
+            from servobench.harness.studies.challenge import challenge_names, find_challenge
+
+            return Names(challenge_names, find_challenge)
+    raise ValueError(f"kind must be plants, controllers or another kind of names, got {kind!r}")
 
 
-def _plants() -> Names:
-    from servobench.harness.config.registry import plant_names
-
-    return Names(plant_names, partial(_choose, "plant"), "plant")
-
-
-def _controllers() -> Names:
+def _begun_controllers(word: str) -> Iterable[str]:
     from servobench.controllers.methods import ESTIMATORS
     from servobench.harness.config.registry import controller_names
 
-    def begun(word: str) -> Iterable[str]:
-        law, plus, _ = word.partition("+")
-        return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
-
-    return Names(controller_names, partial(_choose, "controller"), "controller", begun)
+    law, plus, _ = word.partition("+")
+    return [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names()
 
 
-def _estimators() -> Names:
-    from servobench.controllers.methods import ESTIMATORS
-
-    return Names(lambda: list(ESTIMATORS), str)
-
-
-def _tasks() -> Names:
-    from servobench.harness.run.tasks import choose_task, task_names
-
-    return Names(task_names, choose_task)
-
-
-def _mismatches() -> Names:
-    from servobench.harness.run.request import read_mismatch
+def _begun_mismatches(word: str) -> Iterable[str]:
     from servobench.plant.robot.mismatch import AXES, PROFILES
 
-    def begun(word: str) -> Iterable[str]:
-        before, plus, _ = word.rpartition("+")
-        axes = [f"{before}{plus}{axis}=" for axis in AXES]
-        return axes if plus else [*PROFILES, *axes]
-
-    return Names(lambda: list(PROFILES), read_mismatch, begun=begun)
+    before, plus, _ = word.rpartition("+")
+    axes = [f"{before}{plus}{axis}=" for axis in AXES]
+    return axes if plus else [*PROFILES, *axes]
 
 
-def _robots() -> Names:
+def _find_robot(word: str) -> str:
     from servobench.harness.run.request import find_robot
-    from servobench.plant.robot.catalogue import ROBOTS
 
-    def find(word: str) -> str:
-        if note := find_robot(word).note:
-            say(note)
-        return word
-
-    return Names(lambda: list(ROBOTS), find)
-
-
-def _sensings() -> Names:
-    from servobench.harness.run.request import find_sensing, sensing_names
-
-    return Names(sensing_names, find_sensing)
-
-
-def _challenges() -> Names:
-    from servobench.harness.studies.challenge import challenge_names, find_challenge
-
-    return Names(challenge_names, find_challenge)
-
-
-KINDS: Final[dict[str, Callable[[], Names]]] = {
-    "plants": _plants, "controllers": _controllers, "estimators": _estimators, "tasks": _tasks,
-    "mismatch": _mismatches, "robot": _robots, "sensing": _sensings,
-    "challenges": _challenges,
-}  # fmt: skip
+    if note := find_robot(word).note:
+        say(note)
+    return word
 
 
 def _choose(word: Word, given: str) -> str:

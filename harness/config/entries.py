@@ -10,14 +10,13 @@ line with their place, and answers of a world are checked.
 import hashlib
 import inspect
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar, get_type_hints
+from typing import Any, Final, Generic, Protocol, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -163,40 +162,25 @@ class Named(Protocol):
 Entry = TypeVar("Entry", bound=Named)
 
 
-class Kind(ABC, Generic[Entry]):
+@dataclass(frozen=True)
+class Kind(Generic[Entry]):
     """A kind of object that users may give: controllers, plants, or tasks."""
 
-    word: ClassVar[str]
+    word: str
     """for messages"""
-    entry: ClassVar[type[Any]]
+    entry: type[Any]
     """its class of entries"""
-    bases: ClassVar[tuple[type, ...]]
+    bases: tuple[type, ...]
     """classes below which it may be given"""
-    wanted: ClassVar[str]
+    wanted: str
     """the accepted objects, in words"""
-
-    @abstractmethod
-    def of_class(self, given: type[Any]) -> Entry:
-        """Return the entry of a class."""
-
-    @abstractmethod
-    def check(self, entry: Entry, place: str) -> Entry:
-        """Return an entry that was checked, with a guard around the functions of a user.
-
-        Raises:
-            ConfigurationError: it cannot be used; says the remedy.
-        """
-
-    def of_object(self, given: Any, place: str) -> Entry:  # noqa: ANN401 - of one of `bases`
-        """Return the entry of an object that is built already.
-
-        Raises:
-            ConfigurationError: there is none.
-        """
-        del given
-        raise ConfigurationError(
-            f"{place} is a {self.word} that is built already; give its class, as each run needs one"
-        )
+    of_class: Callable[[type[Any]], Entry]
+    """returns the entry of a class"""
+    check: Callable[[Entry, str], Entry]
+    """returns an entry that was checked, with a guard around the functions of a user; the text is its place, for the
+    `ConfigurationError` of one that cannot be used, which says the remedy"""
+    of_object: Callable[[Any], Entry] | None = None
+    """returns the entry of an object that is built already; None where each run needs one of its own"""
 
     def make_entry(self, given: object, place: str, name: str | None = None) -> Entry:
         """Return the entry of a class, an object or an entry, checked as far as it can be without a robot.
@@ -216,8 +200,12 @@ class Kind(ABC, Generic[Entry]):
         elif isinstance(given, type) and issubclass(given, self.bases):
             check_class(given)
             entry = self.of_class(given)
+        elif isinstance(given, self.bases) and self.of_object is not None:
+            entry = self.of_object(given)
         elif isinstance(given, self.bases):
-            entry = self.of_object(given, place)
+            raise ConfigurationError(
+                f"{place} is a {self.word} that is built already; give its class, as each run needs one"
+            )
         else:
             raise ConfigurationError(f"{place} is {_describe(given)}, {self.wanted}")
         named: Entry = replace(entry, name=name or entry.name)
@@ -226,56 +214,57 @@ class Kind(ABC, Generic[Entry]):
         return self.check(named, place)
 
 
-class _ControllerKind(Kind[ControllerEntry]):
-    word, entry, bases = "controller", ControllerEntry, (Controller,)
-    wanted = "wanted a subclass of servobench.Controller or a servobench.ControllerEntry"
-
-    def of_class(self, given: type[Any]) -> ControllerEntry:
-        config = _config_class(given, "knowledge")
-        build = Guarded(given, Controller, with_config=config is not None)
-        return ControllerEntry(given.__name__, summary_of(given), config or NoSettings, build)
-
-    def of_object(self, given: Controller, place: str) -> ControllerEntry:
-        del place
-        own = type(given)
-        build = Guarded(partial(copy_of, given), Controller, with_config=False)
-        return ControllerEntry(own.__name__, summary_of(own), NoSettings, build)
-
-    def check(self, entry: ControllerEntry, place: str) -> ControllerEntry:
-        check_settings(entry.config, place)
-        guarded = replace(entry, build=(build := _guarded(entry.build, Controller)))
-        aids = getattr(build.make, "aids", None)
-        with configuration_errors(f"{place}: "):
-            return guarded if aids is None else with_aids(guarded, aids)
+def _controller_of_class(given: type[Any]) -> ControllerEntry:
+    config = _config_class(given, "knowledge")
+    build = Guarded(given, Controller, with_config=config is not None)
+    return ControllerEntry(given.__name__, summary_of(given), config or NoSettings, build)
 
 
-class _PlantKind(Kind[PlantEntry]):
-    word, entry, bases = "plant", PlantEntry, (Plant, World)
-    wanted = "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry"
-
-    def of_class(self, given: type[Any]) -> PlantEntry:
-        config = _config_class(given, "setup")
-        default: type[Any] = NoSettings
-        build = Guarded(given, Plant, with_config=config is not None)
-        if issubclass(given, World):
-            build, default = Guarded(partial(on_bench, given, config is not None), Plant), BenchSettings
-        own_robot = bool(given.own_robot)
-        return PlantEntry(given.__name__, summary_of(given), config or default, build, own_robot=own_robot)
-
-    def check(self, entry: PlantEntry, place: str) -> PlantEntry:
-        check_settings(entry.config, place)
-        needs: object = entry.needs
-        if not isinstance(needs, tuple):
-            raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
-        code: Any = entry.build
-        if isinstance(code, type) and issubclass(code, World):
-            code = partial(on_bench, code, True)
-        engine, config_for = (None if each is None else Guarded(each) for each in (entry.engine, entry.config_for))
-        return replace(entry, build=_guarded(code, Plant), engine=engine, config_for=config_for)
+def _controller_of_object(given: Controller) -> ControllerEntry:
+    own, build = type(given), Guarded(partial(copy_of, given), Controller, with_config=False)
+    return ControllerEntry(own.__name__, summary_of(own), NoSettings, build)
 
 
-CONTROLLER: Final = _ControllerKind()
-PLANT: Final = _PlantKind()
+def _checked_controller(entry: ControllerEntry, place: str) -> ControllerEntry:
+    check_settings(entry.config, place)
+    guarded = replace(entry, build=(build := _guarded(entry.build, Controller)))
+    aids = getattr(build.make, "aids", None)
+    with configuration_errors(f"{place}: "):
+        return guarded if aids is None else with_aids(guarded, aids)
+
+
+def _plant_of_class(given: type[Any]) -> PlantEntry:
+    config = _config_class(given, "setup")
+    default: type[Any] = NoSettings
+    build = Guarded(given, Plant, with_config=config is not None)
+    if issubclass(given, World):
+        build, default = Guarded(partial(on_bench, given, config is not None), Plant), BenchSettings
+    own_robot = bool(given.own_robot)
+    return PlantEntry(given.__name__, summary_of(given), config or default, build, own_robot=own_robot)
+
+
+def _checked_plant(entry: PlantEntry, place: str) -> PlantEntry:
+    check_settings(entry.config, place)
+    needs: object = entry.needs
+    if not isinstance(needs, tuple):
+        raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
+    code: Any = entry.build
+    if isinstance(code, type) and issubclass(code, World):
+        code = partial(on_bench, code, True)
+    engine, config_for = (None if each is None else Guarded(each) for each in (entry.engine, entry.config_for))
+    return replace(entry, build=_guarded(code, Plant), engine=engine, config_for=config_for)
+
+
+CONTROLLER: Final = Kind(
+    "controller", ControllerEntry, (Controller,),
+    "wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
+    _controller_of_class, _checked_controller, _controller_of_object,
+)  # fmt: skip
+PLANT: Final = Kind(
+    "plant", PlantEntry, (Plant, World),
+    "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry",
+    _plant_of_class, _checked_plant,
+)  # fmt: skip
 
 
 def _guarded(build: Callable[..., Any], kind: type[Controller] | type[Plant]) -> Guarded:

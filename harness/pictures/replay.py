@@ -8,7 +8,7 @@ import json
 import math
 import re
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -24,7 +24,6 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.room import Overview, Room
-from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot
@@ -52,19 +51,17 @@ class LoggedRun:
     model: HandEyeModel  # the true arm and camera
     moved: HandEyeModel | None  # the same after the camera was moved in the middle of the run; None if it was not
     moved_from: int  # first period that the moved camera sees; the number of periods if none
-    config: RenderedConfig  # the rendered plant's settings, for its camera
     joint_position: FloatArray  # (k, n) [rad], as reported
     ball: FloatArray  # (k, 3) [m], base frame
     reference: FloatArray  # (k, 3) [m], base frame
 
 
-def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[str, Any]) -> LoggedRun:
+def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     """Prepare a run to be shown.
 
     Args:
         row: its row in the table of runs.
         steps: its rows in the table of steps, if any.
-        settings: the rendered plant's settings by name, as a manifest has them; empty for the defaults.
 
     Raises:
         ConfigurationError: a plant that brings its robot, a run without steps, or one whose robot is not found again.
@@ -85,9 +82,6 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
             f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
         )
     model, moved = _true_model(row, robot)
-    known = {item.name for item in fields(RenderedConfig)}
-    with configuration_errors(f"run {run_id}: settings of the camera in the manifest: ", TypeError):
-        config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
     q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
@@ -95,9 +89,8 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         later = points[:0] if moved is None else moved.to_base(points[moved_from:])
         return np.concatenate([model.to_base(points[:moved_from]), later])
 
-    return LoggedRun(
-        track, robot, model, moved, moved_from, config, q, in_base(ball), in_base(track.vectors("reference_"))
-    )
+    reference = track.vectors("reference_")
+    return LoggedRun(track, robot, model, moved, moved_from, q, in_base(ball), in_base(reference))
 
 
 def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:

@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.settings import Settings, default_config
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import (
@@ -43,8 +43,7 @@ from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import likely_meant, remark
 from servobench.plant.contract.signals import PlantSpec
-from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, TrueJacobian
 from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.robot import Robot
@@ -325,21 +324,15 @@ def train_networks(
     Raises:
         ConfigurationError: a name or setting that cannot be used, or a controller without networks.
     """
-    run = settings.resolve("run", RunSettings())
-    plant = KinematicConfig()
     robot = find_robot(robot_name)
-    with configuration_errors():
-        nominal, limits = find_sensing(sensing).nominal(robot), robot.limits
-    spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
-    knowledge = nominal_knowledge(robot, nominal, spec, run)
-    if knowledge.nominal_jacobian is None:
+    if not robot.known:
         raise ConfigurationError(f"networks are trained on a nominal model, and controllers know none of {robot.title}")
-    source = trained_on(in_view(knowledge, nominal, robot), progress)
-    config = settings.resolve(controller, default_config(find_controller(controller)))
-    _build_controller(controller, config, replace(knowledge, train=source), lambda: _equations(nominal))
-    if not source.given:
+    request = RunRequest("kinematic", controller, "target", Mismatch(), 0, robot=robot_name, sensing=sensing)
+    experiment = build(resolve(request, settings), progress=progress)  # networks do not depend on plant and task
+    experiment.plant.close()
+    if not experiment.networks:
         raise ConfigurationError(f"controller {controller} has no networks to train")
-    return source.given[-1]
+    return experiment.networks[-1]
 
 
 def _equations(model: RobotModel | None) -> TrueModel:

@@ -266,23 +266,23 @@ _ENTRIES = (
 TASKS = {entry.name: entry for entry in _ENTRIES}
 
 
-class _TaskKind(Kind[TaskEntry]):
-    word, entry, bases = "task", TaskEntry, (Task,)
-    wanted = "wanted a dataclass below servobench.Task or a servobench.TaskEntry"
-
-    def of_class(self, given: type[Any]) -> TaskEntry:
-        check_settings(given, given.__name__)
-        return TaskEntry(given.__name__, summary_of(given), given())
-
-    def check(self, entry: TaskEntry, place: str) -> TaskEntry:
-        default: object = entry.default
-        if not (isinstance(default, Task) and is_dataclass(type(default))):
-            raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got "
-                                     f"{type(default).__name__}")  # fmt: skip
-        return entry
+def _of_class(given: type[Any]) -> TaskEntry:
+    check_settings(given, given.__name__)
+    return TaskEntry(given.__name__, summary_of(given), given())
 
 
-TASK_REGISTRY: Final = Registry(_TaskKind(), "servobench.tasks", TASKS)
+def _checked(entry: TaskEntry, place: str) -> TaskEntry:
+    default: object = entry.default
+    if not (isinstance(default, Task) and is_dataclass(type(default))):
+        raise ConfigurationError(
+            f"{place}: the settings of a task must be a dataclass below Task, got {type(default).__name__}"
+        )
+    return entry
+
+
+_WANTED: Final = "wanted a dataclass below servobench.Task or a servobench.TaskEntry"
+_KIND: Final = Kind("task", TaskEntry, (Task,), _WANTED, _of_class, _checked)
+TASK_REGISTRY: Final = Registry(_KIND, "servobench.tasks", TASKS)
 find_task, choose_task, task_names = TASK_REGISTRY.find, TASK_REGISTRY.choose, TASK_REGISTRY.names
 
 

@@ -40,7 +40,7 @@ def result():
 
 @pytest.fixture(scope="module")
 def run(result):
-    return logged_run(result.row, result.steps, {})
+    return logged_run(result.row, result.steps)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
 @pytest.fixture(scope="module")
 def move():
     made = run_experiment(RunRequest("kinematic", "calibrated", "exp2", "moderate", 3), Settings())
-    return logged_run(made.row, made.steps, {})
+    return logged_run(made.row, made.steps)
 
 
 def test_snapshots_of_a_move_show_eight_places_and_not_the_arm_at_rest(move):
@@ -253,21 +253,15 @@ def test_a_folder_with_several_runs_wants_a_name(monkeypatch, capsys, tmp_path, 
 def test_runs_that_cannot_be_shown_are_refused(result):
     row, steps = result.row, result.steps
     with pytest.raises(ConfigurationError, match="has no steps: it ended before its first period"):
-        logged_run(row, steps.iloc[:0], {})
+        logged_run(row, steps.iloc[:0])
     with pytest.raises(ConfigurationError, match=r"has 5 joint positions \[rad\]; wanted the 6 of a UR5"):
-        logged_run(row, steps.drop(columns="joint_position_elbow_rad"), {})
+        logged_run(row, steps.drop(columns="joint_position_elbow_rad"))
     other = json.loads(row["mismatch_values"])
     other["tool_offset"][0] += 1e-3
     with pytest.raises(ConfigurationError, match="was made on another robot than mismatch moderate and seed 3"):
-        logged_run(row | {"mismatch_values": json.dumps(other)}, steps, {})
+        logged_run(row | {"mismatch_values": json.dumps(other)}, steps)
     with pytest.raises(ConfigurationError, match="'mild' is not known"):
-        logged_run(row | {"mismatch": "mild"}, steps, {})
-    with pytest.raises(ConfigurationError, match="settings of the camera in the manifest: colour_noise must be"):
-        logged_run(row, steps, {"colour_noise": -1.0})
-
-
-def test_settings_of_another_version_are_passed_over(result):
-    assert logged_run(result.row, result.steps, {"colour_noise": 9.0, "new_in_2030": 1}).config.colour_noise == 9.0
+        logged_run(row | {"mismatch": "mild"}, steps)
 
 
 def run_on(monkeypatch, folder, text, *arguments):
@@ -296,7 +290,7 @@ def test_a_plant_with_a_robot_of_its_own_is_refused(monkeypatch, capsys, tmp_pat
 def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
     request = RunRequest("kinematic", "regression_mfac", "random", "moderate+camera_move=90deg", 3)
     made = run_experiment(request, Settings({"random": {"duration": 2.0}}))
-    shown = logged_run(made.row, made.steps, {})
+    shown = logged_run(made.row, made.steps)
     assert shown.moved_from == 21  # of 40 periods; the move happens during the one before
     arm = np.array([shown.model.to_base(shown.model.feature(q)) for q in shown.joint_position])
     np.testing.assert_allclose(shown.ball, arm, atol=1e-9)
