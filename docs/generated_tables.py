@@ -19,7 +19,7 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- install: report -->
     <!-- end -->
 
-The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
+The meaning of a setting is the string below its field, the default that of the class, with the other choices behind it.
 Several classes share a table, in which a row that is alike in some of them stands once.
 A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
 in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
@@ -70,7 +70,7 @@ PART = re.compile(
 RELEASED = False  # whether a release is on a package index, from which all pages then install
 NEW_LINE = "\n"
 LINE = 120  # letters
-SETTING = ("setting [unit]", "default", "allowed", "meaning")
+SETTING = ("setting [unit]", "default", "meaning")
 
 
 def main() -> None:
@@ -124,7 +124,8 @@ def options_table() -> str:
             if option.param_type_name == "option":
                 words = "`" + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip() + "`"
                 owners.setdefault((words, option.help.replace("\\[", "[").replace("<", "\\<")), []).append(name)
-    rows = [key for key, names in owners.items() if len(names) > 1]
+    several = {words.removesuffix("S`") + "`" for words, _ in owners}  # the list of a name says the same
+    rows = [key for key, names in owners.items() if len(names) > 1 and key[0] not in several]
     return table(("option", "meaning"), rows)
 
 
@@ -212,8 +213,7 @@ def stored_links(part: re.Match[str], folder: Path) -> str:
 def origin(path: Path) -> str:
     """Return how a table was made."""
     stamp = stored_tables.read(path).stamp
-    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
-    return f"`make results ONLY={stamp['study']}`: {made}"
+    return f"commit {stamp['commit'][:12]}, version {stamp['version']}"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
@@ -257,7 +257,10 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
         if not each.meaning:
             raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
         unit = f" [{each.unit}]" if each.unit else ""
-        yield (f"`{each.key}`{unit}", toml(each.value), each.allowed, each.meaning)
+        value = toml(each.value)
+        choices = each.allowed.split(", ") if value in each.allowed.split(", ") else []
+        others = ", ".join(choice for choice in choices if choice != value)
+        yield (f"`{each.key}`{unit}", f"{value}, or {others}" if others else value, each.meaning)
 
 
 def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any settings

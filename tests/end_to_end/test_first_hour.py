@@ -38,7 +38,6 @@ if generated_tables.RELEASED:
     LEFT_OUT["-m venv"] = "every release is installed into a fresh environment, by make release"
 LONG = {  # words of a block that only `make nightly` carries out -> processor time [s]
     "servobench record --robot panda": 90,
-    "for arm in": 85,
     "nominal_rate,nominal_broyden": 25,
 }
 SHIMS = {

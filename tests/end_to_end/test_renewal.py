@@ -70,12 +70,12 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     page.write_text("<!-- table: counts -->\nold\n<!-- end -->\n")
     shown = generated_tables.renewed(page)
     assert "| method | runs |\n| --- | --- |\n| constant | 3 |" in shown
-    assert f"commit {stored.stamp['commit'][:12]}, {stored.stamp['date']}" in shown
+    assert f"commit {stored.stamp['commit'][:12]}, version {stored.stamp['version']}" in shown
     assert "(tables/counts.csv)" in shown
     page.write_text(shown)
     assert generated_tables.renewed(page) == shown
     page.write_text("<!-- stored: counts -->\nold\n<!-- end -->\n")
-    assert "[`counts`](tables/counts.csv) (`make results ONLY=toy`: commit" in generated_tables.renewed(page)
+    assert "[`counts`](tables/counts.csv) (commit" in generated_tables.renewed(page)
 
 
 def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(toy, monkeypatch):
