@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable
 from typing import Any, Final, Literal, final
 
-import casadi
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, Delays, Diagnostics, RobotKnowledge
@@ -312,23 +311,24 @@ def shaped_shares(to_come: FloatArray, taps: FloatArray) -> FloatArray:
     return np.where(ages <= 0, 1.0, commanded[np.maximum(ages, 1) - 1]) @ taps
 
 
-def _linearisation(symbolic: Any, n: int, m: int) -> casadi.Function:  # noqa: ANN401 - CasADi expressions
+def _linearisation(symbolic: Any, n: int, m: int) -> Any:  # noqa: ANN401 - an expression and a function of CasADi
     """Return q -> (h(q), ∂h/∂q) with CasADi's own differentiation.
 
     Raises:
         ValueError: an expression of another size than (m, 1).
     """
+    import casadi  # noqa: PLC0415 - other methods start without it
+
     create: Any = casadi.Function  # its annotations do not know MX
     q = casadi.MX.sym("joint_position", n)
     feature = symbolic(q)
     if feature.shape != (m, 1):
         raise ValueError(f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}")
-    function: casadi.Function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
+    function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
     try:
-        expanded: casadi.Function = function.expand()
+        return function.expand()
     except RuntimeError:  # foreign code, such as an FMU's, has no scalar operations; expanding only saves time
         return function
-    return expanded
 
 
 ENTRY = ControllerEntry(

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
@@ -18,7 +17,6 @@ from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.fmu.world import build_fmu
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.robot import Robot
@@ -65,6 +63,8 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
         CompilationFailed: it has to be built and the compiler refused it.
         ValueError: it has to be built and the cache folder cannot be written.
     """
+    from servobench.fmus.export import export_fmu, fingerprint, nominal_options  # noqa: PLC0415 - loads CasADi
+
     options = nominal_options(fmi_version, robot or find_robot(UR5), sensing)
     name = f"{options.identifier}.fmu"
     key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options)}"
@@ -107,6 +107,8 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
         ValueError: a setting out of its bounds, a start of the wrong size, or an FMU that has to be built and cannot:
             no compiler, or no place in the cache folder.
     """
+    from servobench.plant.fmu.world import build_fmu  # noqa: PLC0415 - loads CasADi
+
     model, _ = setup.robot()
     sensing = Sensing(model.setup, model.mount) if isinstance(model, SetupModel) else None
     with configuration_errors("the FMU cannot be built: "):

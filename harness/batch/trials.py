@@ -192,7 +192,7 @@ def _try_there(_tell: Tell, word: Word, name: str, robot: str) -> tuple[str, str
 def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
     """Return the result of a trial; it is built for a robot if there is one."""
     try:
-        entry = find_controller(name) if word == "controller" else installed_plant(name)
+        entry = find_controller(name) if word == "controller" else installed_plant(name, load=robot is not None)
         if robot is not None and name not in task_names():
             with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
                 (_build_controller if word == "controller" else _build_plant)(name, robot)

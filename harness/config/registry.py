@@ -234,15 +234,19 @@ find_controller, choose_controller = CONTROLLER_REGISTRY.find, CONTROLLER_REGIST
 controller_names = CONTROLLER_REGISTRY.names
 
 
-def installed_plant(name: str) -> PlantEntry:
+def installed_plant(name: str, *, load: bool = True) -> PlantEntry:
     """Return the plant called `name` if all that it needs is installed.
+
+    Args:
+        name: of the plant.
+        load: also load its engine and try its renderer; without, only look for the packages.
 
     Raises:
         ConfigurationError: as `find_plant`, or an extra or a renderer is missing; the message says the remedy.
     """
     entry = find_plant(name)
     check_installed(entry.needs, f"plant {name!r}")
-    lack = "" if entry.lacking is None else entry.lacking()
+    lack = "" if entry.lacking is None or not load else entry.lacking()
     if lack:
         raise ConfigurationError(f"plant {name!r} cannot run here: {lack}")
     return entry

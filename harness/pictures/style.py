@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -315,7 +316,11 @@ def save_figure(
     for ending in formats:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
         with figure_style(TEXT):
-            figure.savefig(paths[-1], dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
+            if ending == "png" and box is None:  # drawn once; `savefig` would draw it twice
+                figure.set_dpi(RESOLUTION)
+                FigureCanvasAgg(figure).print_png(paths[-1], **UNDATED[ending])  # type: ignore[no-untyped-call]
+            else:
+                figure.savefig(paths[-1], dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
         if ending == "pgf":  # without a package for underscores
             text = PGF_TEXT.sub(
                 lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), paths[-1].read_text()

@@ -1,13 +1,17 @@
 """The rendered plants, one for each physics engine."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.rendered.engine import Engine
 from servobench.plant.rendered.settings import RenderedConfig, rendered_config
-from servobench.plant.rendered.world import RenderedWorld
+
+if TYPE_CHECKING:
+    from servobench.plant.rendered.engine import Engine
 
 
 def load_engine(plant: str) -> Engine:
@@ -27,6 +31,8 @@ def build_rendered(plant: str, config: RenderedConfig, setup: PlantSetup) -> Ben
     Raises:
         ValueError: see `RenderedWorld`; or this machine cannot render.
     """
+    from servobench.plant.rendered.world import RenderedWorld  # noqa: PLC0415 - loads OpenCV and CasADi
+
     make = partial(RenderedWorld, load_engine(plant), config)
     return build_bench(make, setup, config.command_delay, config.sensing)
 

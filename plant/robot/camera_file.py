@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-import yaml
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
@@ -206,22 +205,22 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
     return camera
 
 
-class _Loader(yaml.SafeLoader):
-    """Reads OpenCV's matrices as mappings."""
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))  # type: ignore[arg-type]
-
-
 def read_intrinsics(path: Path) -> dict[str, Any]:
     """Return size, matrix and distortion of a `camera_info` of ROS or a file of OpenCV's `FileStorage`.
 
     Raises:
         ValueError: a file that cannot be read, or a key that is missing.
     """
+    import yaml  # noqa: PLC0415 - few runs have such a file
+
+    class Loader(yaml.SafeLoader):
+        """Reads OpenCV's matrices as mappings."""
+
+    tag = "tag:yaml.org,2002:opencv-matrix"
+    Loader.add_constructor(tag, lambda loader, node: loader.construct_mapping(node, True))  # type: ignore[arg-type]
     text = read_text("file", path)
     try:
-        found: Any = yaml.load(text.partition("\n")[2] if text.startswith("%YAML") else text, _Loader)
+        found: Any = yaml.load(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
     keys = dict[str, Any]()

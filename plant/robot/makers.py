@@ -16,7 +16,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.files import user_path
@@ -176,6 +175,8 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     Raises:
         ValueError: the file is missing, is not such a file, or a number in it is not finite.
     """
+    import yaml  # noqa: PLC0415 - lists of names start without it
+
     path = ur5.shipped_calibration() if path is None else path
     try:
         blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]

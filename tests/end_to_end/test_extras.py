@@ -40,11 +40,11 @@ finally:
 
 
 def test_lists_load_no_tables_pictures_or_engines():
-    unused = {"scipy", "pandas", "matplotlib", "pybullet", "mujoco", "cv2"}
+    unused = {"scipy", "casadi", "pandas", "matplotlib", "pybullet", "mujoco", "cv2"}
     script = f"""
 import sys
 from servobench.harness.cli.main import main
-for listed in ("controllers", "tasks"):
+for listed in ("controllers", "plants", "tasks"):
     sys.argv = ["servobench", listed]
     try:
         main()

@@ -17,13 +17,21 @@ from servobench.plant.robot.arm import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec, rotation_matrix
 from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
 from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, ur5_arm
 
 
 def poses(count, n=6, seed=0):
     return np.random.default_rng(seed).uniform(-2 * np.pi, 2 * np.pi, (count, n))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1e-3, 0.3, 7.0])
+def test_the_matrix_of_a_rotation_vector_has_the_bits_of_scipy_in_lanes_and_alone(size):
+    vectors = size * np.random.default_rng(0).normal(size=(500, 3))
+    wanted = Rotation.from_rotvec(vectors).as_matrix()
+    np.testing.assert_array_equal(rotation_matrix(vectors), wanted)
+    np.testing.assert_array_equal([rotation_matrix(vector) for vector in vectors[:50]], wanted[:50])
 
 
 def odd_arm():
