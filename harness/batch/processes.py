@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -68,6 +69,23 @@ def lead_session() -> None:
     """Leave the terminal and its Ctrl-C behind."""
     with contextlib.suppress(OSError):  # it leads one
         os.setsid()
+
+
+def begin(modules: Iterable[str], module: str, function: str, *arguments: object) -> None:
+    """Call a function in a new process, which ends with its parent from before its long imports on.
+
+    Args:
+        modules: imported first, if they can be.
+        module: in which the function is.
+        function: its name.
+        arguments: of the function.
+    """
+    lead_session()
+    end_with_parent()
+    for name in (*modules, module):
+        with contextlib.suppress(Exception):
+            import_module(name)
+    getattr(sys.modules[module], function)(*arguments)
 
 
 def adopt_orphans() -> None:

@@ -27,7 +27,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -237,9 +236,8 @@ class Sandbox:
             resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
         ours, theirs = context.Pipe()
         inherited = (ours,) if self._copied else ()
-        process: BaseProcess = context.Process(
-            target=_keep_guard, args=(theirs, self._limits, tuple(self._modules), inherited)
-        )
+        arguments = (self._modules, __name__, "keep_guard", theirs, self._limits, inherited)
+        process: BaseProcess = context.Process(target=processes.begin, args=arguments)
         with self._lock:
             if self._ended:
                 raise EOFError
@@ -292,16 +290,11 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inherited: Sequence[Connection]) -> None:
+def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]) -> None:
     """Be a guard: take tasks from a link until it closes; `inherited` are ends of links that a copy must not keep."""
     for each in inherited:
         each.close()
-    processes.lead_session()
-    processes.end_with_parent()  # as long as nothing is below this process
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    for name in modules:
-        with contextlib.suppress(Exception):
-            import_module(name)
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports

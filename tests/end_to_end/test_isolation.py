@@ -63,7 +63,7 @@ def assert_nothing_stays(mark: str) -> None:
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory) -> pd.DataFrame:
     """The table of one sweep with all hostile controllers, and one that is quiet at the end."""
-    out, mark = tmp_path_factory.mktemp("hostile") / "out", "swept"
+    out, mark = tmp_path_factory.mktemp("hostile") / "out", f"swept by {os.getpid()}"
     names = (FALSE_WORLD, *WANTED)
     arguments = ("--controllers", places(*names), "--workers", "1", *SHORT, *LIMITS)
     forged = out.with_name("forged")

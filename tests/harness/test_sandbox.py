@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from kit.command import PACKAGE
+from kit.command import PACKAGE, left_behind, wait_for
 from servobench.harness.batch import sandbox
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
@@ -135,6 +135,34 @@ def test_a_guard_that_is_stopped_or_starts_ends_with_the_process_that_started_it
     assert done.returncode == -signal.SIGKILL, done.stderr
     below, deadline = [int(word) for word in done.stdout.split()], time.monotonic() + 5.0
     while left := [each for each in below if psutil.pid_exists(each) and psutil.Process(each).status() != "zombie"]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.05)
+
+
+STUCK = """
+import pathlib, sys, time
+
+class Stuck:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("numpy", "typer") and "--multiprocessing-fork" in sys.orig_argv:
+            pathlib.Path("begun").touch()
+            time.sleep(600.0)
+
+sys.meta_path.insert(0, Stuck())
+"""
+
+
+@pytest.mark.slow
+def test_a_guard_that_has_not_yet_imported_anything_large_ends_with_a_killed_command(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(STUCK)
+    environment = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{tmp_path}", "STUCK": str(tmp_path)}
+    command = [sys.executable, "-m", "servobench", "compare", "--plants", "kinematic", "--controllers", "constant",
+               "--workers", "2", "--out", "out"]  # fmt: skip
+    with subprocess.Popen(command, env=environment, cwd=tmp_path) as process:
+        wait_for((tmp_path / "begun").exists)
+        process.kill()
+    deadline = time.monotonic() + 5.0
+    while left := left_behind("STUCK", str(tmp_path)):
         assert time.monotonic() < deadline, left
         time.sleep(0.05)
 
