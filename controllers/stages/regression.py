@@ -32,7 +32,8 @@ prior.
 All functions are pure; the axis of the filters follows the leading axes of runs side by side.
 """
 
-from typing import Final, NamedTuple, TypeAlias, final
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,7 @@ from servobench.plant.contract.signals import BoolArray
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
 LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
+CACHED: Final = 16  # runs side by side whose filters fit into the cache of a processor
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
 MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
@@ -129,14 +131,26 @@ def learn(
     gain = Ph / capped[..., None]
     gain[..., :-1] *= learns[..., None]
     frames = 1.0 + np.minimum(bank[..., -1, -1] / frame[..., None], 1.0)
-    learned = outer(known, gain)
-    np.subtract(bank, learned, out=learned)  # in place, as a block of a hundred runs is larger than the cache
-    diagonal = learned.reshape(*learned.shape[:-2], -1)[..., m * h.shape[-1] :: h.shape[-1] + 1]
-    diagonal[..., :-1] += walk
-    learned[..., -1] = -share[..., None] * known
-    learned[..., -1, :-1] = learned[..., m:-1, -1]
-    learned[..., -1, -1] = noise * (1.0 - share)
+    learned, noisy, own = np.empty(bank.shape), -share[..., None] * known, noise * (1.0 - share)
+    for part in _parts(bank):
+        new, some = learned[part], np.logical_or.reduce(learns[part].reshape(-1), axis=-1)
+        new[...] = branch(some, _corrected, bank[part], known[part], gain[part])
+        diagonal = new.reshape(*new.shape[:-2], -1)[..., m * h.shape[-1] :: h.shape[-1] + 1]
+        diagonal[..., :-1] += walk[part]
+        new[..., -1], new[..., -1, :-1] = noisy[part], noisy[part][..., m:-1]
+        new[..., -1, -1] = own[part]
     return learned, Innovation(-known[..., :m], square, s, capped, frames)
+
+
+def _parts(bank: FloatArray) -> Sequence[Any]:
+    """Return indices of a few runs side by side each, whose filters fit into the cache of a processor together."""
+    return [slice(k, k + CACHED) for k in range(0, len(bank), CACHED)] if bank.ndim > 3 else [...]
+
+
+def _corrected(bank: FloatArray, known: FloatArray, gain: FloatArray) -> FloatArray:
+    """Return the bank less the products of [W h − Δy, P h], (..., N, m+K), with the gain, (..., N, K)."""
+    change = outer(known, gain)
+    return np.subtract(bank, change, out=change)
 
 
 def of_filter(tree: Tree, index: IntArray) -> Tree:
@@ -152,6 +166,8 @@ class RegressionState(NamedTuple):
     mean: FloatArray  # W̄ with e, (..., m, K)
     share: FloatArray  # Σ μ_b σ'²/s' of the last frame, (...): of its innovation that is noise
     rotation: FloatArray  # R of the filter with the largest weight of those that have one, (..., m, m)
+    rotations: FloatArray  # R of each filter that has one, (..., R, m, m)
+    excess: FloatArray  # (M − R) (P_MM + ς² I)⁻¹ of each of them; like R it changes with W and P_WW only
     streak: IntArray  # number of successive frames that do not fit but agree with each other, (...)
     moves: IntArray  # how often the camera seems to have been moved, (...)
 
@@ -178,12 +194,15 @@ class Regression:
         W = np.zeros((m, self._map.stop))
         W[:, self._map] = np.eye(m)
         bank = fresh_bank(np.broadcast_to(W, (len(PRIOR), *W.shape)), self._P0, frame)
+        near = (*lead, len(ROTATION_DEVIATIONS), m, m)
         return RegressionState(
             np.broadcast_to(bank, (*lead, *bank.shape)),
             np.broadcast_to(PRIOR, (*lead, len(PRIOR))),
             np.broadcast_to(np.concatenate([W, np.zeros((m, 1))], axis=1), (*lead, m, self._map.stop + 1)),
             np.zeros(lead)[()],
             np.broadcast_to(np.eye(m), (*lead, m, m)),
+            np.broadcast_to(np.eye(m), near),
+            np.zeros(near),
             none[()],
             none[()],
         )
@@ -217,8 +236,12 @@ class Regression:
         scores = np.minimum(scores - np.minimum.reduce(scores, axis=-1)[..., None], LEAD_CAP)
         best = scores.argmin(axis=-1)
         streak = self._streak(state, of_filter(found, best), pick(state.bank[..., : self._m, -1], best))
-        state = state._replace(bank=bank, scores=scores, streak=streak)
-        state = branch(streak >= MOVED_FRAMES, self._forget, state, frame)
+        state, jumped = state._replace(bank=bank, scores=scores, streak=streak), streak >= MOVED_FRAMES
+        state = branch(jumped, self._forget, state, frame)
+        before = state.rotations, state.excess
+        columns = state.bank[..., : len(ROTATION_DEVIATIONS), :, self._map]
+        rotations, excess = branch(moved | jumped, self._nearest, before, columns)
+        state = state._replace(rotations=rotations, excess=excess)
         noise = 1.0 - (found.variance - frame[..., None]) / found.capped
         return self._combined(state, best, noise)
 
@@ -287,18 +310,22 @@ class Regression:
 
         so that directions count by their certainty: two known directions of three give the third.
         """
-        m, weights = self._m, self.weights(state)[..., None, None]
-        W, P_M = state.bank[..., :m, :], state.bank[..., m:, :][..., self._map, :]
-        M, P = W[..., self._map], P_M[..., self._map]
+        m, weights, R = self._m, self.weights(state)[..., None, None], state.rotations
         near = len(ROTATION_DEVIATIONS)
-        M, P, P_M = M[..., :near, :, :], P[..., :near, :, :], P_M[..., :near, :, :]
+        W, P_M = state.bank[..., :m, :], state.bank[..., :near, m:, :][..., self._map, :]
+        W = np.concatenate([W[..., :near, :, :] - state.excess @ P_M, W[..., near:, :, :]], axis=-3)
+        mean = np.add.reduce(weights * W, axis=-3)
+        share = np.add.reduce(weights[..., 0, 0] * noise, axis=-1)
+        return state._replace(mean=mean, share=share, rotation=pick(R, np.minimum(best, near - 1)))
+
+    def _nearest(self, _: Any, columns: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ANN401 - those before
+        """Return `rotations` and `excess` of the state for the columns of M of filters, (..., R, m+K, m)."""
+        m = self._m
+        M, P = columns[..., :m, :], columns[..., m:, :][..., self._map, :]
         believed = P + (ROTATION_DEVIATIONS**2)[:, None, None] * np.eye(m)
         try:
             information = np.linalg.inv(believed)
         except np.linalg.LinAlgError as error:
             raise FilterDiverged(f"covariance of the map is singular: {P.tolist()}") from error
         R = nearest_rotation(M @ information)
-        W = np.concatenate([W[..., :near, :, :] - ((M - R) @ information) @ P_M, W[..., near:, :, :]], axis=-3)
-        mean = np.add.reduce(weights * W, axis=-3)
-        share = np.add.reduce(weights[..., 0, 0] * noise, axis=-1)
-        return state._replace(mean=mean, share=share, rotation=pick(R, np.minimum(best, near - 1)))
+        return R, (M - R) @ information

@@ -351,7 +351,7 @@ def test_a_covariance_that_is_singular_is_a_named_fault():
     bank[:near, M + QUADRATIC : -1, QUADRATIC:-1] = -(stage.ROTATION_DEVIATIONS[:, None, None] ** 2) * np.eye(M)
     run.state = run.state._replace(bank=bank)
     with pytest.raises(FilterDiverged, match="covariance of the map is singular"):
-        run.move(LOWER, np.zeros(N), np.zeros(M), np.zeros(M))
+        run.move(LOWER, np.full(N, 0.1), np.zeros(M), np.zeros(M))
 
 
 def test_a_lane_has_the_bits_of_a_single_run():
