@@ -34,6 +34,7 @@ MIN_PAIRS: Final = 6  # least number of equal signs that a two-sided sign test d
 LOST_MARGIN: Final = 0.03  # difference in the share of lost runs up to which methods may be equivalent
 Verdict = Literal["better", "equivalent", "worse", "undecided"]
 RESAMPLES: Final = 2000
+DRAWN_AT_ONCE: Final = 1_000_000  # values of resamples in memory; the same are drawn for any number
 MISSING: Final = "–"  # text for a number that there is not
 
 
@@ -188,8 +189,9 @@ def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "lef
         return Estimate(value, np.nan, np.nan, 1)
     with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
         drawn = stats.bootstrap(
-            (sample,), np.median, n_resamples=RESAMPLES, method="percentile", rng=np.random.default_rng(0)
-        ).bootstrap_distribution
+            (sample,), np.median, n_resamples=RESAMPLES, batch=max(1, DRAWN_AT_ONCE // len(sample)),
+            method="percentile", rng=np.random.default_rng(0),
+        ).bootstrap_distribution  # fmt: skip
     medians = restored(np.sort(drawn))
     cut = int((1.0 - CONFIDENCE) / 2.0 * RESAMPLES)  # order statistics, as nothing lies between a number and infinity
     return Estimate(value, float(medians[cut]), float(medians[-1 - cut]), len(sample))
@@ -292,7 +294,7 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     A task of which no run could be built has no kind and is in neither.
     """
     kinds = texts_of(runs, "task_kind")
-    moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"])] for kind in TASK_KINDS)
+    moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"].unique())] for kind in TASK_KINDS)
     return moves, curves
 
 

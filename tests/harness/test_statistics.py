@@ -107,6 +107,13 @@ def test_a_median_is_infinite_where_half_of_the_runs_never_settle():
     assert (found.value, found.low, found.high) == (np.inf, np.inf, np.inf)
 
 
+def test_an_interval_is_the_same_for_any_number_of_resamples_in_memory(monkeypatch):
+    sample = np.random.default_rng(1).gamma(2.0, size=301)
+    found = median_with_interval(sample)
+    monkeypatch.setattr(statistics, "DRAWN_AT_ONCE", 7 * len(sample))
+    assert median_with_interval(sample) == found
+
+
 def test_what_does_not_apply_is_left_out_when_asked():
     found = median_with_interval([3.0, NEVER, 5.0], missing="left_out")
     assert (found.value, found.count) == (4.0, 2)
