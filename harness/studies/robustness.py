@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 
 from servobench.harness.analysis.comparison import (
     Estimate,
+    column_of,
     median_with_interval,
     settled_share,
     settling_band,
@@ -24,14 +25,13 @@ from servobench.harness.analysis.comparison import (
 )
 from servobench.harness.analysis.loops.loop_analysis import latency_border
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Execution, carry_out_parts
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings
-from servobench.harness.run.resolution import check_settings
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
@@ -40,9 +40,8 @@ from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"
-MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
-STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
-MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
+DURATION: Final = "task.duration"
+LONGER: Final[Varied] = ((DURATION, 20.0),)  # [s], settings of a run whose camera is moved half-way
 FIGURES: Final = "figures"
 LIMITS: Final = "predicted_limits.csv"
 NOTE: Final = 115  # letters of a line below it
@@ -110,13 +109,17 @@ class Scale(NamedTuple):
     top: float  # upper edge of the panels
 
 
-def _cell(place: Place, request: RunRequest) -> Cell:
-    """Return a run at one place of its axis."""
-    if place.magnitude is None or place.axis not in (LATENCY, NOISE):
-        return Cell(replace(request, mismatch=place.vary(request.mismatch)), place.columns)
-    number = place.magnitude.number
-    varied = ((place.axis, number / 1000.0 if place.axis == LATENCY else number),)
-    return Cell(replace(request, varied=varied), place.columns)
+def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONGER) -> Grid[Cell]:
+    """Return the runs of the map; those whose camera is moved have the settings `moving`."""
+
+    def cell(place: Place, request: RunRequest) -> Cell:
+        number = 0.0 if place.magnitude is None else place.magnitude.number
+        known: dict[str, Varied] = {LATENCY: ((LATENCY, number / 1000.0),), NOISE: ((NOISE, number),), MOVE: moving}
+        mismatch = request.mismatch if place.axis in (LATENCY, NOISE) else place.vary(request.mismatch)
+        return Cell(replace(request, mismatch=mismatch, varied=known.get(place.axis, ())), place.columns)
+
+    places = [Place(line.axis, magnitude) for line in lines for magnitude in line.places]
+    return Grid(cell, places, batch.requests())
 
 
 def batch_of_map(
@@ -149,18 +152,13 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
     (plant,) = batch.plants
     if find_plant(plant).own_robot:
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
-    check_settings(settings, [plant, TASK, *batch.controllers])
-    settings = Settings(settings.sections)  # each part reads some of them
-    static, moved = map_cells(batch, lines)
-    parts = {STATIC_CAMERA: Campaign(static, settings), MOVED_CAMERA: Campaign(moved, moved_settings(settings))}
-    made = {name: campaign for name, campaign in parts.items() if len(campaign.cells)}
-    carry_out_parts(made, out, how)
-    results.write_summary(out, map_tables(out), results.read_manifest(out / next(iter(made))))
+    moving = () if "duration" in settings.sections.get(TASK, {}) else LONGER  # a duration that a user gives is kept
+    carry_out(Campaign(map_cells(batch, lines, moving), settings), out, how)
     limits: dict[str, float] = {}
     if any(line.axis == LATENCY for line in lines) and batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED:
         limits = predicted_limits(batch.controllers, settings, batch.robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
-    return draw_map(results.load_runs(out), out / FIGURES, limits)
+    return draw_map(map_runs(out), out / FIGURES, limits)
 
 
 def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str = DEFAULT_ROBOT) -> dict[str, float]:
@@ -180,36 +178,16 @@ def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str 
     return limits
 
 
-def map_cells(batch: Batch, lines: Sequence[Line] = LINES) -> tuple[Grid[Cell], Grid[Cell]]:
-    """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
-    static, moved = (
-        [Place(line.axis, magnitude) for line in lines if (line.axis == MOVE) == moves for magnitude in line.places]
-        for moves in (False, True)
-    )
-    return Grid(_cell, static, batch.requests()), Grid(_cell, moved, batch.requests())
-
-
-def moved_settings(settings: Settings) -> Settings:
-    """Return the settings of the runs whose camera is moved; a duration that the user gives is kept."""
-    task = {"duration": MOVE_DURATION, **settings.sections.get(TASK, {})}
-    return Settings({**settings.sections, TASK: task})
-
-
-def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the runs of a map by part; `moved_at_s` says when the camera was moved, NaN where it was not.
-
-    A map along few axes may have one part only.
+def map_runs(folder: Path) -> pd.DataFrame:
+    """Return the runs of a map; `moved_at_s` says when the camera was moved, NaN where it was not.
 
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    parts = [name for name in (STATIC_CAMERA, MOVED_CAMERA) if (folder / name).exists()]
-    tables = {name: results.load_runs(folder / name) for name in parts}
-    if (moved := tables.get(MOVED_CAMERA)) is not None:
-        configuration = results.read_manifest(folder / MOVED_CAMERA)["configuration"]
-        moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
-        tables[MOVED_CAMERA] = moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment))
-    return tables
+    runs, configuration = results.load_runs(folder), results.read_manifest(folder)["configuration"]
+    durations = column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
+    moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)
+    return runs.assign(moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved))
 
 
 def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | None = None) -> list[Path]:

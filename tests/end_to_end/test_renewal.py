@@ -253,7 +253,7 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
     )  # fmt: skip
     assert servobench(monkeypatch, *arguments) == 0
     assert "the map is in" in capsys.readouterr().out
-    assert len(results.load_runs(out / "moved")) == 5
+    assert len(results.load_runs(out)) == 7
     assert {path.name for path in (out / "figures").iterdir()} == {
         "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
     }  # fmt: skip

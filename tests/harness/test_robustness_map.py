@@ -23,7 +23,7 @@ from servobench.harness.studies.robustness import (
     draw_map,
     find_lines,
     map_cells,
-    moved_settings,
+    map_runs,
     predicted_limits,
     settling_median,
 )
@@ -33,33 +33,40 @@ from servobench.plant.robot.mismatch import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
-    usual, moved = map_cells(batch_of_map("kinematic", ["constant", "broyden"], [0, 1, 2]))
-    cells = [*usual, *moved]
-    assert len({cell.request.run_id for cell in usual}) == len(usual)
-    assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
-    assert {cell.columns["axis"] for cell in moved} == {MOVE}
-    assert {str(cell.request.mismatch) for cell in moved} >= {"moderate+camera_move=90deg"}
-    latencies = {cell.request.varied for cell in usual if cell.columns["axis"] == "latency"}
+    cells = [*map_cells(batch_of_map("kinematic", ["constant", "broyden"], [0, 1, 2]))]
+    assert len({cell.request.run_id for cell in cells}) == len(cells) == 6 * sum(len(line.places) for line in LINES)
+    moved = [cell.request for cell in cells if cell.columns["axis"] == MOVE]
+    assert {str(request.mismatch) for request in moved} >= {"moderate+camera_move=90deg"}
+    assert {request.varied for request in moved} == {(("task.duration", 20.0),)}
+    latencies = {cell.request.varied for cell in cells if cell.columns["axis"] == "latency"}
     assert latencies == {(("plant.sensing.latency", late),) for late in (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)}
-    noise = {cell.request.varied for cell in usual if cell.columns["axis"] == "noise"}
+    noise = {cell.request.varied for cell in cells if cell.columns["axis"] == "noise"}
     assert noise == {(("plant.sensing.noise_factor", factor),) for factor in (0.0, 1.0, 2.0, 4.0, 8.0)}
 
 
 def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
     lines = find_lines(["jitter", "outliers"])
     assert [line.axis for line in lines] == ["outliers", "jitter"]
-    static, moved = map_cells(batch_of_map("kinematic", ["constant"], [0]), lines)
-    assert len(moved) == 0
-    assert {str(cell.request.mismatch) for cell in static} >= {"moderate+outliers=40%", "moderate+jitter=200ms"}
+    requests = [cell.request for cell in map_cells(batch_of_map("kinematic", ["constant"], [0]), lines)]
+    assert {request.varied for request in requests} == {()}
+    assert {str(request.mismatch) for request in requests} >= {"moderate+outliers=40%", "moderate+jitter=200ms"}
     assert find_lines([]) is LINES
     assert {*SENSOR_AXES} <= {*KNOWN_LINES}
     with pytest.raises(ConfigurationError, match="the map has no axis 'outlier': did you mean 'outliers'"):
         find_lines(["outlier"])
 
 
-def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long():
-    assert moved_settings(Settings()).sections["random"]["duration"] == 20.0
-    assert moved_settings(Settings({"random": {"duration": 5.0}})).sections["random"]["duration"] == 5.0
+def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long(monkeypatch, tmp_path):
+    monkeypatch.setattr(robustness, "LONGER", ((robustness.DURATION, 0.4),))
+    line = Line(MOVE, "camera moved half-way [°]", (Magnitude(0.0, "deg"), Magnitude(90.0, "deg")))
+    monkeypatch.setattr(robustness, "KNOWN_LINES", {MOVE: line})
+    words = ("--axes", MOVE, "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1")
+    for name, given, periods in (("usual", (), 8), ("given", ("--set", "random.duration=0.2"), 4)):
+        out = tmp_path / name
+        assert servobench(monkeypatch, "robustness", *words, *given, "--out", str(out)) == 0
+        runs = map_runs(out)
+        assert runs["periods"].tolist() == [periods] * 2
+        assert runs["moved_at_s"].tolist() == pytest.approx([math.nan, 0.025 * periods], nan_ok=True)
 
 
 def test_settling_counts_from_the_move_of_the_camera():
@@ -141,13 +148,13 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
 
 
 def test_a_map_of_pixels_has_them_at_every_place():
-    usual, moved = map_cells(batch_of_map("kinematic", ["constant"], [0], sensing="stereo:hand"))
-    assert {cell.request.sensing for cell in [*usual, *moved]} == {"stereo:hand"}
+    cells = map_cells(batch_of_map("kinematic", ["constant"], [0], sensing="stereo:hand"))
+    assert {cell.request.sensing for cell in cells} == {"stereo:hand"}
 
 
 def test_the_map_of_another_arm_has_its_runs_and_its_prediction():
-    usual, moved = map_cells(batch_of_map("kinematic", ["constant"], [0], "panda"))
-    assert {cell.request.robot for cell in [*usual, *moved]} == {"panda"}
+    cells = map_cells(batch_of_map("kinematic", ["constant"], [0], "panda"))
+    assert {cell.request.robot for cell in cells} == {"panda"}
     fast = Settings({"pid+constant": {"law": {"proportional_gain": 9.0}}})
     limits = [predicted_limits(["pid+constant"], fast, robot)["pid+constant"] for robot in ("ur5", "panda")]
     assert 0.0 < limits[1] < 0.25
