@@ -41,7 +41,8 @@ MARK_COLOURS: Final = (
     MarkColour((0.05, 0.75, 0.15, 1.0), ((46, 120, 40), (65, 255, 255))),  # green
     MarkColour((0.85, 0.05, 0.80, 1.0), ((139, 120, 40), (157, 255, 255))),  # magenta
 )
-EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse
+EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse,
+BALL_EDGE = 0.12  # or that of a ball as a share of its half axes: its stick hides a part of the rim that grows with it
 MIN_HALF_AXIS = 1.5  # [px] of the ellipse of a mark
 NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 ELLIPSE = 2.0  # standard deviations of a filled ellipse from its middle to its edge
@@ -64,30 +65,32 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | N
     """
     hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
     masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
+    share = BALL_EDGE if len(colours) == 1 else 0.0
     found: list[Mark | None] = []
     for number, mask in enumerate(masks):
         patch = largest_patch(mask)
         others = masks[:number] + masks[number + 1 :]
-        if patch is None or not fills_ellipse(patch) or _touches(patch, others):
+        if patch is None or not fills_ellipse(patch, share) or _touches(patch, others):
             found.append(None)
         else:
             found.append(_with_shares(patch, rgb, colours[number].paint))
     return found
 
 
-def fills_ellipse(patch: Patch) -> bool:
-    """Return whether pixels fill an ellipse and nothing outside of it, to within `EDGE`."""
+def fills_ellipse(patch: Patch, share: float = 0.0) -> bool:
+    """Return whether pixels fill an ellipse and nothing else, to within `EDGE` or a share of its half axes, if more."""
     x = np.stack([patch.columns, patch.rows], axis=-1).astype(np.float64)
     middle = x.mean(axis=0)
     sizes, axes = np.linalg.eigh(np.cov(x.T, bias=True))
     half = ELLIPSE * np.sqrt(np.maximum(sizes, 0.0))
     if half[0] < MIN_HALF_AXIS:
         return False
+    edge = np.maximum(EDGE, share * half)
     lower = np.array([patch.columns.min(), patch.rows.min()])
     width, height = np.array([patch.columns.max(), patch.rows.max()]) - lower + 1
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + lower
-    inner = (((grid - middle) @ axes / (half - EDGE).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
-    outer = (((grid - middle) @ axes / (half + EDGE)) ** 2).sum(axis=-1) <= 1.0
+    inner = (((grid - middle) @ axes / (half - edge).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
+    outer = (((grid - middle) @ axes / (half + edge)) ** 2).sum(axis=-1) <= 1.0
     filled = np.zeros((height, width), dtype=np.bool_)
     filled[patch.rows - lower[1], patch.columns - lower[0]] = True
     return bool((filled | ~inner).all() and (outer | ~filled).all())

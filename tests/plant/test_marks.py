@@ -62,6 +62,18 @@ def test_a_sphere_off_the_axis_has_its_centre_where_the_ray_through_it_appears()
     assert np.linalg.norm(disc_centre(mark, CAMERA) - true) > 0.4
 
 
+@pytest.mark.parametrize("depth", [0.4, 0.25])
+def test_a_ball_is_found_though_its_stick_hides_some_of_the_rim_and_not_if_half_is_hidden(depth):
+    radius = CAMERA.focal * 0.035 / depth
+    for wide, below, whole in ((0.25, 0.86, True), (1.2, 0.5, False)):
+        image = blank()
+        u, v = draw_sphere(image, 0, (0.0, 0.0, depth), 0.035)
+        image[(np.abs(COLUMNS - u) < wide * radius) & (ROWS - v > below * radius)] = (66, 71, 79)
+        (mark,) = find_marks(image, MARK_COLOURS[:1])
+        assert (mark is not None) == whole
+        assert not whole or np.linalg.norm(sphere_centre(mark, CAMERA) - (u, v)) < 0.03 * radius
+
+
 @pytest.mark.parametrize("cover", [0.15, 0.3, 0.6])
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_mark_that_something_covers_in_part_is_not_measured_and_its_neighbour_is(cover, side):
