@@ -3,6 +3,7 @@
 import operator
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, TypeAlias
@@ -97,6 +98,7 @@ def compare(
     settings: Sections | None = None,
     out: Path | str | None = None,
     workers: int = 1,
+    executor: Executor | None = None,
     run_timeout: float | None = None,
     run_memory: float | None = None,
     isolate: bool = False,
@@ -117,7 +119,9 @@ def compare(
         sensings: see `run`.
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
-        workers: number of processes.
+        workers: number of processes, or of those that `executor` has.
+        executor: of `concurrent.futures`, which carries the runs out in processes of its own, also on other machines:
+            a `ProcessPoolExecutor`, `MPIPoolExecutor` of mpi4py, or `client.get_executor(pure=False)` of Dask.
         run_timeout: [s] time limit of a run; None for the usual one, if any.
         run_memory: [bytes] memory limit of a run, likewise.
         isolate: carry out code that is not servobench's in processes of its own, with limits, also with one worker.
@@ -139,7 +143,7 @@ def compare(
         names = tuple(choose_controller(each) for each in controllers)
         worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
-        how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
+        how = Execution(workers, executor, Bounds(run_timeout, run_memory, isolate), resume)
         if not can_travel(offered([*worlds, *names, *batch.tasks])):
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)

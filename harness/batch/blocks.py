@@ -1,4 +1,4 @@
-"""The lower half of the driver: blocks of runs, carried out in this process, in sandboxes or on a Dask cluster.
+"""The lower half of the driver: blocks of runs, carried out in this process, in sandboxes or by an executor of others.
 
 The runs of a block advance together, one control period after the other, where they are alike enough for that; all
 others go one by one. A run has the same row either way, but for the times of its steps, which only a run that goes by
@@ -16,9 +16,11 @@ import math
 import pickle
 import re
 import sys
+import zlib
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -162,10 +164,11 @@ def carry_out_blocks(
             yield block.part(0, len(done)), done
 
 
-def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResult], list[Block]]:  # noqa: ANN401 - or Dask's
+def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> tuple[list[RunResult], list[Block]]:
     """Return the results of the first runs of a block, and in blocks the runs that are still to be carried out."""
     try:
-        answer: Answer = future.result()
+        told = future.result()
+        answer = told if isinstance(told, Answer) else Answer(json.loads(zlib.decompress(told)))
     except workers.lost:
         answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
     match answer.items:
@@ -393,7 +396,7 @@ def can_travel(own: Sequence[Offer]) -> bool:
 @contextlib.contextmanager
 def open_workers(
     count: int | None = None,
-    scheduler: str | None = None,
+    scheduler: str | Executor | None = None,
     bounds: Bounds = Bounds(),  # noqa: B008 - it is frozen
     *,
     plants: Iterable[str] = (),
@@ -405,8 +408,10 @@ def open_workers(
 
     Args:
         count: number of processes on this machine; with 1, methods of this package on its plants are carried out in
-            this process unless a limit is given. None for the number of processors.
-        scheduler: address of a Dask scheduler, such as "tcp://127.0.0.1:8786"; None for processes of this machine.
+            this process unless a limit is given. None for the number of processors. With an executor, the number of
+            its workers.
+        scheduler: address of a Dask scheduler, such as "tcp://127.0.0.1:8786", or an executor whose workers are
+            processes with servobench; None for processes of this machine.
         bounds: resources of a run.
         plants: names of the plants of the runs.
         controllers: names of the controllers.
@@ -414,16 +419,19 @@ def open_workers(
         trusted: names of FMUs that may share a process with the code of this package.
 
     Raises:
-        ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a limit is asked
-            for on a cluster.
+        ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, a limit is asked
+            for elsewhere, or an executor has threads.
     """
-    if scheduler is not None and count is not None:
+    if isinstance(scheduler, str) and count is not None:
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
     count = count or min(MAX_DEFAULT_WORKERS, available_processors())
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:
                 raise ConfigurationError(f"{option} works with processes of this machine only, not with --scheduler")
+        if isinstance(scheduler, Executor):
+            yield _workers_of(scheduler, count)
+            return
         with _open_cluster(scheduler) as workers:
             yield workers
         return
@@ -462,17 +470,21 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
                 f"the scheduler {scheduler} has no workers; start some with `dask worker {scheduler} --nthreads 1`"
             ) from error
 
-        def submit(task: Task) -> Any:  # noqa: ANN401 - a future
-            return client.submit(_gather, task, pure=False)
-
         threads = sum(client.nthreads().values())
-        yield Workers(submit, threads, cluster=True, lost=(KilledWorker,))
+        yield _workers_of(client.get_executor(pure=False), threads, lost=(KilledWorker,))
     finally:
         client.close()
 
 
-def _gather(task: Task) -> Answer:
-    """Carry a task out on a cluster."""
-    answer = Answer()
-    task.carry_out(lambda item: None if item is None else answer.items.append(item))
-    return answer
+def _workers_of(executor: Executor, count: int, lost: tuple[type[BaseException], ...] = ()) -> Workers:
+    """Return the workers of an executor; `lost` are the errors of its futures whose process died."""
+    if isinstance(executor, ThreadPoolExecutor):
+        raise ConfigurationError("an executor must have processes: threads would share the state of solvers and files")
+    return Workers(lambda task: executor.submit(_gather, task), count, cluster=True, lost=lost)
+
+
+def _gather(task: Task) -> bytes:
+    """Carry a task out elsewhere; its answers travel as one compressed block."""
+    items: list[object] = []
+    task.carry_out(lambda item: None if item is None else items.append(item))
+    return zlib.compress(json.dumps(items).encode(), 1)

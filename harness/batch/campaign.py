@@ -8,6 +8,7 @@ when they are needed, so that the memory of this process does not grow with thei
 
 import json
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -98,7 +99,7 @@ class Execution:
     """How the runs of a campaign are carried out."""
 
     workers: int | None = None  # number of processes; None for the number of processors
-    scheduler: str | None = None  # address of a Dask scheduler; None for processes of this machine
+    scheduler: str | Executor | None = None  # Dask's address, or an executor; None for processes of this machine
     bounds: Bounds = field(default_factory=Bounds)  # resources of a run
     resume: bool = False  # carry out the runs that are missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress

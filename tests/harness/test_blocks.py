@@ -6,7 +6,8 @@ import contextlib
 import itertools
 import json
 import math
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from servobench.harness.batch import blocks, results
 from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
+from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Answer, End, Workers
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity
@@ -46,6 +48,33 @@ def alone(tmp_path_factory) -> pd.DataFrame:
     runs = results.load_runs(folder)
     assert times(runs).notna().all(axis=None)
     return judged(runs)
+
+
+class Here(Executor):
+    """An executor with `submit` only, which carries everything out at once."""
+
+    def submit(self, function, /, *arguments, **named):
+        future = Future()
+        future.set_result(function(*arguments, **named))
+        return future
+
+
+def processes():
+    return ProcessPoolExecutor(2, get_context("spawn"))
+
+
+@pytest.mark.parametrize("make", [Here, pytest.param(processes, marks=pytest.mark.slow)])
+def test_any_executor_gives_the_rows_of_this_process(alone, tmp_path, make):
+    with make() as executor:
+        carry_out(CAMPAIGN, tmp_path / "out", Execution(2, executor, block=7))
+    pd.testing.assert_frame_equal(judged(results.load_runs(tmp_path / "out")), alone, check_exact=True)
+
+
+def test_an_executor_of_threads_or_with_limits_of_runs_is_refused(tmp_path):
+    with ThreadPoolExecutor(1) as threads, pytest.raises(ConfigurationError, match="an executor must have processes"):
+        carry_out(CAMPAIGN, tmp_path / "out", Execution(1, threads))
+    with pytest.raises(ConfigurationError, match="works with processes of this machine only"):
+        carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Here(), Bounds(5.0)))
 
 
 @pytest.mark.parametrize(("block", "workers"), [(7, 1), (1000, 1), (1000, 2)])
