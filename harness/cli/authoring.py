@@ -26,7 +26,10 @@ NEXT: Final = {  # kind of a new file -> the next commands
     "plant": ("check plant {}", "run --plant {}"),
 }
 COLOURS: Final = {"ok": "green", "failed": "bold red", "note": "yellow"}
-LEGEND: Final = "The log does not answer to the controller, so that this does not say how well it would have done."
+LEGEND: Final = (
+    "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
+    "The log does not answer to the controller, so that this does not say how well it would have done."
+)
 
 
 def new(
@@ -120,13 +123,13 @@ def shadow(
     sensing: options.SensingOption = "position",
     out: Annotated[Path | None, option("FILE", "CSV file for the commands of the controller at each instant.")] = None,
 ) -> None:
-    """Show a controller a logged run and compare commands.
+    """Compare commands and predictions of a controller with a log.
 
-    Nothing is simulated: its commands do not change the log.
+    Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
     """
     from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.config.registry import choose_controller, find_controller
-    from servobench.harness.run.shadow import differences, has_commands
+    from servobench.harness.run.shadow import differences, has_commands, predictions
     from servobench.harness.run.shadow import shadow as see
 
     if not log.exists():
@@ -149,12 +152,16 @@ def shadow(
         resolved, table = logged_in_file(log, chosen, robot, sensing)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
+    name, ahead = resolved.request.controller, predictions(seen)
     if out is not None:
         with writing(out):
             write_csv(seen, out)
         say(f"table in {out}")
-    elif not has_commands(seen):
+    elif not has_commands(seen) and ahead.empty:
         raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
-    if has_commands(seen):
-        rows = differences(seen).map(lambda each: each if isinstance(each, str) else f"{each:.3g}")
-        print_tables([(f"{resolved.request.controller} beside the log", rows)], LEGEND)
+    if ahead.empty:
+        say(f"{name} gives no Jacobian that could predict a feature")
+    tables = [(f"{name} beside the log", differences(seen))] if has_commands(seen) else []
+    tables += [(f"Features one frame ahead, by the Jacobian of {name}", ahead)] * (not ahead.empty)
+    words = [(title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}")) for title, rows in tables]
+    print_tables(words, LEGEND)

@@ -1,7 +1,13 @@
-"""A controller beside a logged run: its commands for the observations of each instant.
+"""A controller beside a logged run: its commands for the observations of each instant, and its one-step predictions.
 
 The loop is open. Joint positions and features are those of the log, independent of the commands, so nothing here
 predicts a run under these commands; only the answers to the same observations are compared.
+
+The Jacobian Ĵ_k that the controller holds at a valid frame k, learned up to this frame, predicts the next one, l:
+
+    ŷ_l = y_k + Ĵ_k (q(t_l − d_k) − q(t_k − d_k))
+
+with the logged joint positions q and the delay d_k of the camera that the controller has identified, 0 without one.
 """
 
 import math
@@ -13,7 +19,7 @@ import pandas as pd
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
-from servobench.harness.run.log import StepLog
+from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import LoopSettings, careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
@@ -26,6 +32,10 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 LOG: Final = "the log"  # in error messages
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
+PREDICTED: Final = "predicted_"  # before the name of a column of features
+DELAY: Final = "delay"  # diagnostic of controllers that identify the camera's delay [s]
+MAX_DELAY: Final = 0.25  # [s] up to which another delay is tried
+MIN_GAIN: Final = 0.8  # [1] share of the prediction error that another delay leaves, below which it is remarked on
 MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
 MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
 MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
@@ -133,7 +143,8 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         table: a row a control period; see `LoggedPlant`. Where commands were logged, they are kept for comparison.
 
     Returns:
-        The table of steps with the controller's commands, and those of the log under names that begin with `LOGGED`.
+        The table of steps with the controller's commands, those of the log under names that begin with `LOGGED`, and
+        the features that its Jacobian predicts under names that begin with `PREDICTED`.
 
     Raises:
         ConfigurationError: settings or a log that cannot be used, or the controller failed.
@@ -156,8 +167,11 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         raise ConfigurationError(f"controller {request.controller} fails in row {row} of the log: {fault}") from fault
     finally:
         experiment.plant.close()
-    steps = log.steps().table(request.run_id)
-    names = column_names(spec)[COMMAND]
+    rows = log.steps()
+    steps, names = rows.table(request.run_id), column_names(spec)[COMMAND]
+    if not np.isnan(ahead := predicted(rows)).all():
+        steps[[PREDICTED + name for name in column_names(spec)["feature"]]] = ahead
+        _check_delay(rows, ahead)
     if set(names) <= set(table):
         steps[[LOGGED + name for name in names]] = commands = numbers_of(LOG, table, names)
         if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
@@ -169,16 +183,61 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     return steps
 
 
+def predicted(steps: Steps, delay: float | None = None) -> FloatArray:
+    """Return the feature that the Jacobian of the valid frame before predicts for each valid frame, as above.
+
+    Args:
+        steps: of one run.
+        delay: d [s] at all frames; by default that of the controller.
+
+    Returns:
+        (k, m) [unit of the feature]; NaN where no valid frame is at most `MAX_LATE` periods before, where the
+        controller had no Jacobian, and where the joint motion began before the log.
+    """
+    y, t = np.full_like(steps.feature, np.nan), steps.time
+    late = steps.diagnostics.get(DELAY, np.zeros_like(t)) if delay is None else np.full_like(t, delay)
+    frames = np.flatnonzero(steps.feature_valid)
+    begin, end = frames[:-1], frames[1:]
+    known = (end - begin <= MAX_LATE) & (t[begin] - late[begin] >= t[0])
+    begin, end = begin[known], end[known]
+    moved = [
+        np.interp(t[end] - late[begin], t, q) - np.interp(t[begin] - late[begin], t, q) for q in steps.joint_position.T
+    ]
+    y[end] = steps.feature[begin] + np.matvec(steps.estimated_jacobian[begin], np.transpose(moved))
+    return y
+
+
+def _check_delay(steps: Steps, ahead: FloatArray) -> None:
+    """Remark on a camera that is later than the controller takes it to be, given its predictions (k, m)."""
+    delays = steps.spec.period * np.arange(1 + int(MAX_DELAY / steps.spec.period))
+    tried = np.array([ahead, *(predicted(steps, delay) for delay in delays)])
+    common = np.isfinite(tried).all(axis=(0, 2))
+    if not common.any():
+        return
+    own, *others = (_rms(each) for each in (steps.feature - tried)[:, common])
+    best = int(np.argmin(others))
+    if others[best] < MIN_GAIN * own:
+        remark(
+            f"features of the log come {delays[best]:g} s after the joint motion: with this delay the Jacobian would "
+            f"predict them with {others[best] / own:.0%} of the error; look for the controller's setting of the delay"
+        )
+
+
+def _rms(values: FloatArray) -> float:
+    """Return the root of the mean squared length of vectors (k, m)."""
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
+
+
 def _apart(y: FloatArray, p: FloatArray, unit: str) -> float:
     """Return the share of the motion of features (k, m) that no image of the others explains; 0 for short motions."""
     y, p = y - y.mean(axis=0), p - p.mean(axis=0)
-    seen, made = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (y, p))
+    seen, made = _rms(y), _rms(p)
     if max(seen, made) < MIN_MOTION:
         return 0.0
     image = nearest_rotation(y.T @ p).T if unit == "m" else np.linalg.lstsq(p, y, rcond=None)[0]
     if unit != "m" and 8.0 * seen < made:
         return 1.0
-    rest = float(np.sqrt(np.mean(np.sum((y - p @ image) ** 2, axis=1))))
+    rest = _rms(y - p @ image)
     return rest / (max(seen, made) if unit == "m" else seen)
 
 
@@ -205,3 +264,26 @@ def differences(steps: pd.DataFrame) -> pd.DataFrame:
     joints = [name.removeprefix(f"{COMMAND}_") for name in names]
     columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
     return pd.DataFrame(dict(zip(columns, (joints, *rms, np.abs(apart).max(axis=0)), strict=True)))
+
+
+def predictions(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return how well the controller's Jacobian predicts the features of a table of `shadow`, one frame ahead.
+
+    Returns:
+        A row a feature, and one for their sum of squares: RMS of the motion from frame to frame, which is the error of
+        predicting no motion; RMS of the error of the prediction; and their ratio. The first two are in the unit that
+        the name ends with. A perfect Jacobian leaves the noise of two frames, √2 σ. Empty where nothing is predicted.
+    """
+    names = [name for name in map(str, steps) if name.startswith(PREDICTED)]
+    if not names:
+        return pd.DataFrame()
+    features = [name.removeprefix(PREDICTED) for name in names]
+    y, ahead = steps[features], steps[names].set_axis(features, axis=1)
+    known = ahead.notna().all(axis=1)
+    before = y.where(steps["feature_valid"]).ffill().shift()
+    squares = [((y - each)[known] ** 2).mean() for each in (before, ahead)]
+    motion, error = (np.sqrt([*each, each.sum()]) for each in squares)
+    titles = [*(name.removeprefix("feature_") for name in features), "all"]
+    columns = ("feature", "motion, RMS", "prediction error, RMS", "error / motion")
+    ratio = np.divide(error, motion, out=np.full_like(error, np.nan), where=motion > 0.0)
+    return pd.DataFrame(dict(zip(columns, (titles, motion, error, ratio), strict=True)))

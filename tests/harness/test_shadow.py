@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import numpy as np
@@ -12,7 +13,8 @@ from kit.broken_controllers import stepping
 from kit.command import servobench
 from servobench import compare, run
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
-from servobench.harness.run.shadow import COMMAND, LOGGED, differences, shadow
+from servobench.harness.config.registry import choose_controller
+from servobench.harness.run.shadow import COMMAND, LOGGED, differences, predictions, shadow
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 
@@ -87,8 +89,17 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(steps, tmp
     assert np.abs(commands(seen)).max() > 0.1
     with pytest.raises(ConfigurationError, match="the log has no commands to compare with"):
         differences(seen)
-    assert servobench(monkeypatch, "shadow", str(table), "--controller", "constant") == 2
+    assert servobench(monkeypatch, "shadow", str(table), "--controller", "constant") == 0
+    printed = capsys.readouterr().out
+    assert "Features one frame ahead, by the Jacobian of constant" in printed
+    assert "beside the log" not in printed
+    (tmp_path / "mapless.py").write_text(PROPORTIONAL, encoding="utf-8")
+    mapless = str(tmp_path / "mapless.py")
+    assert servobench(monkeypatch, "shadow", str(table), "--controller", mapless) == 2
     assert "--out FILE.csv keeps those of the controller" in capsys.readouterr().err
+    out = ("--out", str(tmp_path / "seen.csv"))
+    assert servobench(monkeypatch, "shadow", str(table), "--controller", mapless, *out) == 0
+    assert "gives no Jacobian that could predict a feature" in capsys.readouterr().out
     assert servobench(monkeypatch, "shadow", str(table)) == 2
     assert "name one with --controller" in capsys.readouterr().err
 
@@ -159,9 +170,9 @@ def lap():
     return run("ukf_mfac", task="circle", settings={"circle": {"laps": 1}}).steps
 
 
-def show(table, path):
+def show(table, path, controller="constant"):
     table.to_csv(path, index=False)
-    return shadow(*logged_in_file(path, "constant", "ur5", "position"))
+    return shadow(*logged_in_file(path, controller, "ur5", "position"))
 
 
 @pytest.mark.parametrize("slip", SLIPS)
@@ -193,7 +204,71 @@ def test_another_robot_than_that_of_a_folder_is_refused(folder, monkeypatch, cap
     assert "--sensing pixel is not that of the run, position" in capsys.readouterr().err
 
 
-def test_a_log_of_another_true_robot_and_a_late_camera_is_shown_without_a_remark(tmp_path, caplog):
+def test_a_log_of_another_true_robot_and_a_late_camera_is_that_of_this_arm(tmp_path, caplog):
     late = {"kinematic": {"sensing": {"latency": 0.2}}, "circle": {"laps": 1}}
     show(run("ukf_mfac", task="circle", mismatch="severe", settings=late).steps, tmp_path / "log.csv")
-    assert not caplog.text
+    assert "move otherwise" not in caplog.text
+    assert "features of the log come 0.2 s after the joint motion" in caplog.text
+
+
+NOISE, MOTION, LATE = 0.001, 0.5, 0.1  # [m], [m/rad] of the oracle's map, [s]
+ZERO, COUNT = "return servobench.Command(np.zeros(self.n))", itertools.count()
+
+
+def oracle_log(steps, late=0.0):
+    """Return the log of an arm whose features are MOTION times its first three joint positions, `late` [s] earlier."""
+    t, generator = np.arange(400) * 0.05, np.random.default_rng(0)
+    names = {kind: [each for each in steps if each.startswith(kind)] for kind in (JOINTS, *FEATURES)}
+    speeds = np.array([2.7, 3.9, 2.1, 3.3, 2.4, 3.0])
+    q = {late: steps[names[JOINTS]].to_numpy()[0] + 0.2 * np.sin(speeds * (t[:, None] - late)) for late in (0.0, late)}
+    y = MOTION * q[late][:, :3] + NOISE * generator.normal(size=(400, 3))
+    features = [names[kind][0] for kind in FEATURES[:3]]
+    columns = {"time_s": t} | dict(zip(names[JOINTS], q[0.0].T, strict=True)) | dict(zip(features, y.T, strict=True))
+    return pd.DataFrame(columns | dict.fromkeys(names["reference_"], 0.0) | {"feature_valid": 1})
+
+
+def scores(table, path, factor, delay=0.0):
+    """Return the scores of a controller that rests, with `factor` times the oracle's map and a delay [s] of its own."""
+    module = f"\n    def estimated_jacobian(self):\n        return {factor * MOTION} * np.eye(3, self.n)\n"
+    text = stepping(ZERO, module=module).replace("return {}", f"return {{'delay': {delay}}}")
+    name = f"Held{next(COUNT)}"
+    (path / f"{name}.py").write_text(text.replace("Mine", name))
+    held = choose_controller(str(path / f"{name}.py"))
+    seen = show(table, path / "log.csv", held)
+    return seen, predictions(seen).set_index("feature")
+
+
+@pytest.mark.parametrize("late", [0.0, LATE])
+def test_the_true_map_with_the_true_delay_leaves_noise_alone_and_a_wrong_one_more(steps, tmp_path, late):
+    table = oracle_log(steps, late)
+    names = ["motion, RMS", "prediction error, RMS", "error / motion"]
+    motion, error, ratio = (scores(table, tmp_path, 1.0, late)[1][name] for name in names)
+    np.testing.assert_allclose(error[:3], np.sqrt(2.0) * NOISE, rtol=0.1)
+    assert error["all"] == pytest.approx(np.linalg.norm(error[:3]))
+    assert ratio["all"] == pytest.approx(error["all"] / motion["all"])
+    assert ratio["all"] < 0.2
+    wrong = scores(table, tmp_path, 1.3, late)[1]["error / motion"]
+    assert wrong["all"] == pytest.approx(np.hypot(0.3, ratio["all"]), rel=0.1)
+    np.testing.assert_allclose(scores(table, tmp_path, 0.0, late)[1]["error / motion"], 1.0, rtol=1e-12)
+
+
+def test_a_camera_later_than_the_controller_takes_it_to_be_is_remarked_on(steps, tmp_path, caplog):
+    table = oracle_log(steps, LATE)
+    remark.cache_clear()
+    known = scores(table, tmp_path, 1.0, LATE)[1]["error / motion"]["all"]
+    assert not [each for each in caplog.messages if "after the joint motion" in each]
+    assert scores(table, tmp_path, 1.0)[1]["error / motion"]["all"] > 2.0 * known
+    assert "features of the log come 0.1 s after the joint motion" in caplog.text
+
+
+def test_features_are_predicted_over_lost_frames_from_the_last_valid_one(steps, tmp_path):
+    table, lost = oracle_log(steps), np.arange(400) % 4 > 1
+    table.loc[lost, "feature_x_m"] = 7.0
+    table.loc[lost, "feature_valid"] = 0
+    error = scores(table, tmp_path, 1.0)[1]["prediction error, RMS"]
+    np.testing.assert_allclose(error[:3], np.sqrt(2.0) * NOISE, rtol=0.15)
+    table.loc[:380, "feature_valid"] = 0
+    table.loc[[0, 1, 50], "feature_valid"] = 1  # 49 periods between frames are too many for one Jacobian
+    ahead = scores(table, tmp_path, 1.0)[0]["predicted_feature_x_m"]
+    assert ahead.first_valid_index() == 1
+    assert np.isnan(ahead[50])
