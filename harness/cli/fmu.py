@@ -55,6 +55,12 @@ class Export:
         return RunRequest(*names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing)
 
 
+def check_ending(output: Path, ending: str) -> None:
+    """Raise ConfigurationError if the file to write does not end as importing tools expect it to."""
+    if output.suffix != ending:
+        raise ConfigurationError(f"--output must end in {ending}, got {output}")
+
+
 @fmu_app.command()
 @command
 def export(
@@ -82,8 +88,7 @@ def export(
         raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     if controller is not None and (exported.mismatch != "none" or exported.seed):
         raise ConfigurationError("--mismatch and --seed are for an arm; a controller does not know them")
-    if output.suffix != ".fmu":
-        raise ConfigurationError(f"--output must end in .fmu, got {output}")
+    check_ending(output, ".fmu")
     with exported.compiling() as platforms:
         request = exported.request(controller or "constant", settings)
         if controller is None:
@@ -113,6 +118,7 @@ def ssp(
     from servobench.fmus.ssp import write_loop
     from servobench.harness.run.export import loop_products
 
+    check_ending(output, ".ssp")
     settings = overrides.settings()
     request = exported.request(controller, settings)
     with exported.compiling() as platforms:

@@ -254,6 +254,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("shadow", "text.csv", "--controller", "constant", "--run", "a"), "--run names a run of a results folder, and"),
     (("shadow", "text.csv", "--controller", "calibrated"), "is given the true robot, which text.csv does not"),
     (("fmu", "export", "-o", "arm"), "--output must end in .fmu, got arm"),
+    (("fmu", "ssp", "-o", "loop", "--controller", "ukf_mfac"), "--output must end in .ssp, got loop"),
     (("fmu", "export", "-o", "x.fmu", "--controller", "broyden", "--seed", "3"), "--mismatch and --seed are for an"),
     (("fmu", "export", "-o", "x.fmu", "--mismatch", "outliers=40%"), "is exported without outliers: leave it out"),
     (("fmu", "export", "-o", "x.fmu", "--mismatch", "camera_move=9deg"), "an arm is exported without camera_move"),
