@@ -113,6 +113,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             from servobench.harness.run.request import DEFAULT_ROBOT, with_camera
 
             values["robot"] = with_camera(values["robot"] or DEFAULT_ROBOT, camera)
+        if values.get("mismatch") == DEFAULT_MISMATCH and values.get("robot"):
+            from servobench.harness.run.request import find_robot
+
+            values["mismatch"] = "none" if find_robot(values["robot"]).twin else DEFAULT_MISMATCH
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
         with offering():  # a user's own controllers have their names for as long as the command takes
@@ -126,9 +130,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
+DEFAULT_MISMATCH: Final = "moderate"
 AXES = "none, factory, moderate, severe, or axes, such as links=10%+tool=20mm"
 LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
-ROBOT_WORDS = "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf."
+ROBOT_WORDS = (
+    "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: UR calibration (.yaml), DH table or twin (.toml), .urdf."
+)
 RobotOption = Annotated[
     str,
     named_option(
@@ -199,7 +206,7 @@ class Combinations:
     plants: PlantsOption = "kinematic"
     controllers: ControllersOption = "all"
     tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
-    mismatch: Annotated[str, option(MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
+    mismatch: Annotated[str, option(MISMATCH.several(), f"Comma-separated: {AXES}.")] = DEFAULT_MISMATCH
     robot: RobotOption = "ur5"
     sensing: Annotated[
         str,

@@ -52,7 +52,7 @@ def run(
     ] = None,
     estimator: Annotated[str | None, option(ESTIMATOR, "Compose the law --controller with this estimator.")] = None,
     task: options.TaskOption = "exp2",
-    mismatch: options.MismatchOption = "moderate",
+    mismatch: options.MismatchOption = options.DEFAULT_MISMATCH,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     seed: Annotated[int, option("INTEGER", "Seed of everything random in the run.")] = 0,

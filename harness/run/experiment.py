@@ -101,7 +101,11 @@ def draw_robot(request: RunRequest) -> tuple[RobotModel, MismatchSample, CameraD
     """
     robot, seed = find_robot(request.robot), named_seed(request.seed, "mismatch")
     arm, sample = sample_mismatch(request.mismatch, robot, seed)
-    true, cameras = find_sensing(request.sensing).true(robot, arm, sample, request.mismatch, seed)
+    sensing = find_sensing(request.sensing)
+    true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
+    if robot.twin is not None:
+        exact = not request.mismatch.moves_robot
+        true = robot.twin.model(sensing.nominal(robot), request.sensing, request.seed, exact=exact)
     return true, sample, cameras
 
 

@@ -12,7 +12,7 @@ from servobench.harness.config.registry import (
     is_foreign_controller,
     plant_names,
 )
-from servobench.harness.config.settings import Settings, default_config, nest
+from servobench.harness.config.settings import Settings, default_config, flatten, nest
 from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied, find_robot
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
@@ -20,6 +20,7 @@ from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.twin import Twin
 
 
 class Sections(dict[str, Any]):
@@ -112,7 +113,8 @@ def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # no
         raise ConfigurationError(f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply")
     config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)
     with configuration_errors():
-        return config if camera is None else replace(config, sensing=camera.sensing(config.sensing, period))
+        config = config if camera is None else replace(config, sensing=camera.sensing(config.sensing, period))
+        return config if robot.twin is None else override(name, config, robot.twin.plant_settings(config, period))
 
 
 def select(request: RunRequest, sections: Sections) -> ResolvedRun:
@@ -128,16 +130,24 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
         known = "gears and tools are those of kinematic and fmu"
         raise ConfigurationError(f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}")
     plant = request.varied_in("plant")
+    twin = find_robot(request.robot).twin
+    drawn = () if twin is None else _drawn_times(twin, flatten(sections[request.plant]), request.seed)
     for key, _ in plant:
         if key in of_sensor:
             raise ConfigurationError(f"plant.{key} is varied, and the mismatch {request.mismatch} sets it, too")
     return ResolvedRun(
         request,
         sections.with_changes("run", request.varied_in("run")),
-        sections.with_changes(request.plant, (*of_sensor.items(), *plant)),
+        sections.with_changes(request.plant, (*drawn, *of_sensor.items(), *plant)),
         sections.with_changes(request.controller, request.varied_in("controller")),
         sections.with_changes(request.task, request.varied_in("task")),
     )
+
+
+def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:
+    """Return the times of a twin's run that differ from those of its mean, but for times that a user has set."""
+    mean = twin.times(0)
+    return tuple((key, time) for key, time in twin.times(seed).items() if usual.get(key) == mean[key] != time)
 
 
 def check_settings(settings: Settings, running: Iterable[str]) -> None:

@@ -61,6 +61,9 @@ class Sensor:
         self._config, self.jitters = config, config.jitter > 0.0 or config.latency_swing > 0.0
         self._scale = config.noise_factor * extents.feature_noise
         stream: Callable[..., Stream] = partial(Stream, seed)
+        self._shape = np.array(config.noise_shape)
+        if config.noise_shape and self._shape.shape != (m, m):
+            raise ValueError(f"sensing.noise_shape needs {m} rows of {m} numbers, got {list(config.noise_shape)}")
         self._noise = stream("feature_noise", family_of(config, extents), (m,), self._scale)
         share = np.random.Generator.random
         self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
@@ -75,7 +78,8 @@ class Sensor:
         """Return a true feature, (..., m), as the next frame shows it."""
         config = self._config
         if self._scale > 0.0:
-            feature = feature + self._noise.next()
+            noise = self._noise.next()
+            feature = feature + (np.matvec(self._shape, noise) if self._shape.size else noise)
         if config.outliers > 0.0:
             frames = self._frames[0]
             begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)

@@ -230,6 +230,20 @@ class SetupModel(RobotModel):
         cameras[..., 0, :, :] = pose
         return replace(self, cameras=cameras)
 
+    def with_arm(self, arm: SerialArm) -> Self:
+        """Return this model with another arm; see `RobotModel.with_arm`."""
+        moved = (arm.tool - self.arm.tool)[..., None, :] if self.mount == "fixed" else 0.0
+        return replace(self, arm=arm, target=self.target + moved)
+
+    def with_lens(self, deviation: FloatArray) -> Self:
+        """Return this model with deviating intrinsics; see `RobotModel.with_lens`."""
+        focal, u, v, bend = deviation
+        lens, centre = self.optics, np.array([u, v])
+        optics = replace(
+            lens, focal=lens.focal * (1.0 + focal), centre=lens.centre + centre, distortion=lens.distortion + bend
+        )
+        return replace(self, optics=optics)
+
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""
         if self.mount == "fixed":

@@ -65,6 +65,8 @@ class SensingConfig:
     """[s] J: each frame is late by U(0, J) in addition to the latency; frames do not overtake each other."""
     noise: Family = "white"
     """Family of the noise of each component."""
+    noise_shape: tuple[tuple[Number, ...], ...] = ()
+    """[1] rows of a matrix L by which the noise is multiplied; empty for the identity."""
     noise_share: Share = 0.1
     """[1] ρ, share of the noise that is displaced, for "mixture" and "bimodal"."""
     noise_offset: Extent = 0.02

@@ -16,13 +16,14 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.contract.files import user_path
+from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
+from servobench.plant.robot.twin import read_twin
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
@@ -79,7 +80,14 @@ def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
 def _read(text: str, changed: int) -> Robot:
     from servobench.plant.robot.files import read_robot  # noqa: PLC0415 - only files need their readers
 
-    return read_robot(text)
+    path = user_path(text)
+    values = read_toml("robot file", path) if path.suffix.lower() == ".toml" else {}
+    if "robot" not in values:
+        return read_robot(text)
+    if (named := str(values["robot"])) == text or (robot := find_robot(named)).twin is not None:
+        raise ValueError(f"twin {path}: its robot must be the one that controllers know, got the twin {named}")
+    twin = read_twin(path, values, robot.arm)
+    return replace(robot, name=path.stem, title=f"{robot.title} twin", source=path.name, twin=twin)
 
 
 RANDOM_ARM: Final = "random_arm"  # followed by a colon and the number

@@ -59,6 +59,15 @@ class RobotModel(ABC):
         """Return this model with its first camera at another pose, (..., 4, 4)."""
 
     @abstractmethod
+    def with_arm(self, arm: SerialArm) -> Self:
+        """Return this model with another arm, and the target on its flange where that arm's tool is."""
+
+    def with_lens(self, deviation: FloatArray) -> Self:
+        """Return this model with deviating intrinsics, 1 + focal, centre [px] and distortion, (4,), if it has any."""
+        del deviation
+        return self
+
+    @abstractmethod
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the point about which the first camera is turned, (..., 3) m, in the frame that it is mounted on.
 
@@ -173,6 +182,10 @@ class HandEyeModel(RobotModel):
     def with_camera(self, pose: FloatArray) -> Self:
         """Return this model with the camera at another pose, (..., 4, 4)."""
         return replace(self, X_BC=pose)
+
+    def with_arm(self, arm: SerialArm) -> Self:
+        """Return this model with another arm."""
+        return replace(self, arm=arm)
 
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the middle of the workspace, about which the camera is turned."""

@@ -128,6 +128,12 @@ class Mismatch:
         given = dict(self.axes)
         return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
 
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot or its camera differs from the nominal one at the start of a run."""
+        own = set(AXES) - set(SENSOR_AXES) - set(MECHANICS_AXES) - {"camera_move"}
+        return self.profile == "factory" or any(self.size(axis) > 0.0 for axis in own)
+
     @cached_property
     def plant_settings(self) -> dict[str, float | str]:
         """Settings of the plant that the axes of sensor, gears and tool stand for, by dotted key.

@@ -21,6 +21,7 @@ from servobench.plant.robot.arm import JointLimits, SerialArm, rotation_from_rpy
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.camera_file import OwnCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.twin import Twin
 from servobench.plant.robot.workspace import Clearance, Workspace
 
 
@@ -73,6 +74,7 @@ class Robot:
         note: a line for the user about assumptions; empty for none.
         known: whether controllers may know it; of another one they know joints and features alone.
         camera: of the user, in place of the bench's; None for none.
+        twin: the true robot as identified from a log, in place of mismatches; None for none.
     """
 
     name: str
@@ -86,6 +88,7 @@ class Robot:
     note: str = ""
     known: bool = True
     camera: OwnCamera | None = None
+    twin: Twin | None = None
 
     @property
     def n(self) -> int:

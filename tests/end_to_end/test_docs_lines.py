@@ -44,6 +44,7 @@ OWN = (
     "my_world.toml",
     "my_arm.urdf",
     "mine.toml",
+    "twin.toml",
     "crane.toml",
     "planar",
     "nominal_rate",

@@ -1,0 +1,188 @@
+"""Twins: robots as they were identified from a log of theirs, read from a TOML file.
+
+A twin deviates from the robot that it names, which controllers know, by parameters with a normal posterior. A run with
+seed s has θ = mean + factorᵀ z, with z ~ N(0, 1) drawn from s and z = 0 for seed 0. Parameters by name:
+
+    latency, command_delay, lag    [s] of the camera, of commands and of the joints
+    camera_turn_x ...              [rad] rotation vector of the camera in its own frame, from the pose of the file on
+    camera_x ...                   [m] of the camera in the base frame, likewise
+    tool_x ...                     [m] added to the marker's place in the flange frame
+    focal, centre_u, centre_v, distortion   [1, px, px, 1] of an image: factor 1 + focal; the others are added
+    gear_JOINT, zero_JOINT         [1, rad] factor 1 + gear on the reported position, and offset of the true angle
+    link_I_x ...                   [1] factor 1 + link on a length of the I-th fixed translation, from 0 on
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.settings import (
+    NonNegative,
+    Number,
+    ShareBelowOne,
+    did_you_mean,
+    nested,
+    override,
+    settings,
+)
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.camera_file import CameraFile
+from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
+
+TIMES: Final = ("latency", "command_delay", "lag")
+CAMERA: Final = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
+TOOL: Final = ("tool_x", "tool_y", "tool_z")
+LENS: Final = ("focal", "centre_u", "centre_v", "distortion")
+MIN_LENGTH: Final = 1e-6  # [m] of a translation that is a length
+Rows = tuple[tuple[Number, ...], ...]
+
+
+def parameter_names(arm: SerialArm) -> tuple[str, ...]:
+    """Return the names of all parameters of an arm and its camera."""
+    joints = [f"{kind}_{name}" for kind in ("gear", "zero") for name in arm.joint_names]
+    return (*TIMES, *CAMERA, *TOOL, *LENS, *joints, *(name for name, _, _ in _links(arm)))
+
+
+def _links(arm: SerialArm) -> Iterator[tuple[str, int, int]]:
+    """Yield the name of each length of an arm with its row and axis among the translations."""
+    for row, axis in np.argwhere(np.abs(arm.translation) > MIN_LENGTH).tolist():
+        yield f"link_{row}_{'xyz'[axis]}", row, axis
+
+
+def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
+    """Return a model with the deviations of its parameters by name; one that is left out is 0."""
+
+    def given(*names: str) -> FloatArray:
+        return np.array([values.get(name, 0.0) for name in names])
+
+    arm, pose = model.arm, np.array(model.camera)
+    translation = arm.translation.copy()
+    for name, row, axis in _links(arm):
+        translation[row, axis] *= 1.0 + values.get(name, 0.0)
+    arm = replace(
+        arm,
+        translation=translation,
+        joint_offset=arm.joint_offset + given(*(f"zero_{name}" for name in arm.joint_names)),
+        gear_ratio=arm.gear_ratio * (1.0 + given(*(f"gear_{name}" for name in arm.joint_names))),
+        tool=arm.tool + given(*TOOL),
+    )
+    pose[:3, :3] = pose[:3, :3] @ rotation_matrix(given(*CAMERA[:3]))
+    pose[:3, 3] += given(*CAMERA[3:])
+    return model.with_arm(arm).with_camera(pose).with_lens(given(*LENS))
+
+
+@settings
+class TwinFile:
+    """The keys of a file."""
+
+    robot: str = ""
+    """Of which it is the twin, as after --robot."""
+    sensing: str = "position"
+    """With which it was logged."""
+    camera: CameraFile = nested(CameraFile)
+    """Pose, latency and rate of the camera; keys as in the file of a camera."""
+    covariance: Rows = ()
+    """[m² or px²] of the feature's noise."""
+    lost_frames: ShareBelowOne = 0.0
+    """[1] share of the frames."""
+    outliers: ShareBelowOne = 0.0
+    """[1] share of the frames."""
+    outlier_size: NonNegative = 0.0
+    """[m or px] their usual distance."""
+    mean: dict[str, Number] = field(default_factory=dict)
+    """Parameters by name, but for those of the camera; one that is left out is 0."""
+    parameters: tuple[str, ...] = ()
+    """Names of the columns of the factor."""
+    factor: Rows = ()
+    """A row for each independent direction; factorᵀ factor is the covariance of the parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A robot as it was identified from a log.
+
+    Attributes:
+        path: of the file.
+        keys: of the file.
+    """
+
+    path: Path
+    keys: TwinFile
+
+    def values(self, seed: int) -> dict[str, float]:
+        """Return the parameters of a run with a seed by name."""
+        keys, values = self.keys, {**self.keys.mean, "latency": self.keys.camera.latency or 0.0}
+        z = named_generator(seed, "twin").standard_normal(len(keys.factor)) * (seed > 0)
+        change = z @ np.array(keys.factor) if keys.factor else np.zeros(len(keys.parameters))
+        for name, own in zip(keys.parameters, change.tolist(), strict=True):
+            values[name] = values.get(name, 0.0) + own
+        return values
+
+    def model(self, nominal: RobotModel, sensing: str, seed: int, *, exact: bool) -> RobotModel:
+        """Return the true robot of a run with a seed.
+
+        Args:
+            nominal: which controllers know.
+            sensing: of the run.
+            seed: of the run.
+            exact: whether no mismatch moves the robot.
+
+        Raises:
+            ValueError: another sensing than that of the log, or a mismatch.
+        """
+        if sensing != self.keys.sensing:
+            raise ValueError(f"twin {self.path} was logged with --sensing {self.keys.sensing}, got {sensing}")
+        if not exact:
+            words = "leave the mismatch out, but for camera_move and words of sensor, gears and tool"
+            raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")
+        return deviated(nominal.with_camera(self.keys.camera.pose.matrix), self.values(seed))
+
+    def times(self, seed: int) -> dict[str, float]:
+        """Return the known ones of latency, delay and lag of a run by key of a plant [s], rounded to milliseconds."""
+        drawn = self.values(seed)
+        given: dict[str, float] = {name: max(0, round(1e3 * drawn[name])) / 1e3 for name in TIMES if name in drawn}
+        return {"sensing.latency": given.pop("latency"), **given}
+
+    def plant_settings(self, config: Any, period: float) -> dict[str, Any]:  # noqa: ANN401 - of any plant
+        """Return the settings of the mean, nested, of a plant with a configuration and a control `period` [s]."""
+        keys, times, unit = self.keys, self.times(0), "" if self.keys.sensing == "position" else "px"
+        sensing: dict[str, Any] = {"latency": times.pop("sensing.latency")}
+        sensing |= {"drop_probability": keys.lost_frames, "outliers": keys.outliers}
+        if keys.covariance:
+            scale = float(np.sqrt(np.trace(keys.covariance) / len(keys.covariance)))
+            shape = np.linalg.cholesky(np.array(keys.covariance)) / scale
+            sensing |= {"feature_noise": f"{scale}{unit}" if unit else scale, "noise_shape": shape.tolist()}
+        if keys.outliers > 0.0:
+            sensing["outlier_size"] = f"{keys.outlier_size}{unit}" if unit else keys.outlier_size
+        if keys.camera.rate is not None:
+            sensing["frame_period"] = max(1, round(1.0 / (keys.camera.rate * period))) * period
+        known = {each.name for each in fields(config)}
+        return {name: value for name, value in {**times, "sensing": sensing}.items() if name in known}
+
+
+def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
+    """Return the twin with the content of a file, given the nominal arm of its robot.
+
+    Raises:
+        ValueError: an unknown key or parameter, or a value that cannot be used.
+    """
+    keys, known, what = override(f"twin {path}", TwinFile(), values), parameter_names(arm), f"twin {path}"
+    for name in (*keys.mean, *keys.parameters):
+        if name not in known or (name in keys.mean and name in ("latency", *CAMERA)):
+            raise ValueError(f"{what}: {keys.robot} has no parameter {name!r} there{did_you_mean(name, known)}")
+    if keys.camera.pose.frame != "base":
+        raise ValueError(f'{what}: camera.pose must have frame = "base", position and rotation')
+    if any(len(row) != len(keys.parameters) for row in keys.factor):
+        raise ValueError(f"{what}: each row of factor needs {len(keys.parameters)} numbers, one for each parameter")
+    size = len(keys.covariance)
+    square = np.array(keys.covariance) if {len(row) for row in keys.covariance} == {size} else np.zeros((size, size))
+    if size and not (np.allclose(square, square.T) and np.linalg.eigvalsh(square)[0] > 0.0):
+        raise ValueError(f"{what}: covariance must be a symmetric, positive definite matrix")
+    return Twin(path, keys)
