@@ -131,7 +131,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 DEFAULT_MISMATCH: Final = "moderate"
-AXES = "none, factory, moderate, severe, or axes, such as links=10%+tool=20mm"
+AXES = "none, factory, lab, moderate, severe, or axes, such as links=10%+tool=20mm"
 LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
 ROBOT_WORDS = (
     "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: UR calibration (.yaml), DH table or twin (.toml), .urdf."

@@ -152,6 +152,7 @@ def claims(
         Literal["equipped", "published", "both"],
         option("NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."),
     ] = "both",
+    mismatch: options.MismatchOption = "moderate",
     running: options.Running,
     check: Annotated[
         Path | None, option("FILE", "Table of answers that must come out the same; the exit code is 1 if they differ.")
@@ -169,7 +170,7 @@ def claims(
     divisions = [name for name in DIVISIONS if division in ("both", name.split()[-1])]
     wanted = None if check is None else reproduction.read_answers(check)
     with watching(console, out, running.execution()) as how:
-        answers = reproduction.reproduce(out, names, seeds, how, divisions)
+        answers = reproduction.reproduce(out, names, seeds, how, divisions, mismatch)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
         verdict = answer.verdict + reproduction.elsewhere(answer, answers)

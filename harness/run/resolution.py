@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from typing import Any
 
 from servobench.harness.config.registry import (
@@ -19,6 +20,7 @@ from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import override
+from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin
 
@@ -129,7 +131,7 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     if mechanical and "mechanics" not in {field.name for field in fields(sections[request.plant])}:
         known = "gears and tools are those of kinematic and fmu"
         raise ConfigurationError(f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}")
-    plant = request.varied_in("plant")
+    plant, of_profile = request.varied_in("plant"), _of_profile(request, sections)
     twin = find_robot(request.robot).twin
     drawn = () if twin is None else _drawn_times(twin, flatten(sections[request.plant]), request.seed)
     for key, _ in plant:
@@ -138,7 +140,7 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     return ResolvedRun(
         request,
         sections.with_changes("run", request.varied_in("run")),
-        sections.with_changes(request.plant, (*drawn, *of_sensor.items(), *plant)),
+        sections.with_changes(request.plant, (*drawn, *of_profile.items(), *of_sensor.items(), *plant)),
         sections.with_changes(request.controller, request.varied_in("controller")),
         sections.with_changes(request.task, request.varied_in("task")),
     )
@@ -148,6 +150,26 @@ def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:
     """Return the times of a twin's run that differ from those of its mean, but for times that a user has set."""
     mean = twin.times(0)
     return tuple((key, time) for key, time in twin.times(seed).items() if usual.get(key) == mean[key] != time)
+
+
+def _of_profile(request: RunRequest, sections: Sections) -> dict[str, float]:
+    """Return the settings of the plant that come with the profile of the mismatch, by dotted key.
+
+    Those that the plant does not have, or that differ from its defaults already, are left out; so is the noise of
+    features that are found in images with a noise of their own.
+    """
+    profile = PROFILE_SETTINGS.get(request.mismatch.profile, {})
+    if not profile:
+        return {}
+    config, period = sections[request.plant], sections["run"].period
+    default = _plant_default(find_plant(request.plant), find_robot(request.robot), period)
+    own = {field.name for field in fields(config)}
+    return {
+        key: value
+        for key, value in profile.items()
+        if key.partition(".")[0] in own and attrgetter(key)(config) == attrgetter(key)(default)
+        if "depth_noise" not in own or key != "sensing.feature_noise"
+    }
 
 
 def check_settings(settings: Settings, running: Iterable[str]) -> None:

@@ -112,13 +112,16 @@ class Answer:
         return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
 
 
-def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> dict[str, Campaign]:
+def studies(
+    plants: Sequence[str], seeds: int, division: str = "best equipped", mismatch: str = MISMATCH
+) -> dict[str, Campaign]:
     """Return the studies by name on `plants`: `seeds` robots for each move, two fifths of them for the circle.
 
     Args:
         plants: names.
         seeds: number of robots.
         division: a key of `DIVISIONS`.
+        mismatch: of all robots.
     """
     suffix = DIVISIONS[division]
     rendered = {name: {"scenery": False} for name in RENDERED}  # the same observations, bit for bit, in less time
@@ -127,7 +130,7 @@ def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") 
 
     def cells(controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]) -> tuple[Cell, ...]:
         names = tuple(name + suffix for name in controllers)
-        batch = Batch(tuple(plants), names, tasks, (MISMATCH,), chosen)
+        batch = Batch(tuple(plants), names, tasks, (mismatch,), chosen)
         return tuple(Cell(request) for request in batch.requests())
 
     four = (PROPOSED, *OTHERS)

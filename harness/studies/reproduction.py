@@ -17,7 +17,16 @@ from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
-from servobench.harness.studies.claims import DIVISIONS, MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
+from servobench.harness.studies.claims import (
+    DIVISIONS,
+    MAIN,
+    MISMATCH,
+    UNDECIDED,
+    Answer,
+    Measurement,
+    answer_all,
+    studies,
+)
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
@@ -32,7 +41,12 @@ Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]  # claim, plant, 
 
 
 def reproduce(
-    out: Path, plants: Sequence[str], robots: int, how: Execution, divisions: Sequence[str] = tuple(DIVISIONS)
+    out: Path,
+    plants: Sequence[str],
+    robots: int,
+    how: Execution,
+    divisions: Sequence[str] = tuple(DIVISIONS),
+    mismatch: str = MISMATCH,
 ) -> list[Answer]:
     """Carry out the runs and answer the claims.
 
@@ -42,6 +56,7 @@ def reproduce(
         robots: number of robots for each move; two fifths of them for the circle.
         how: how the runs are carried out.
         divisions: how the methods are equipped, keys of `DIVISIONS`.
+        mismatch: of all robots.
 
     Returns:
         The answers of all plants and divisions, by claim.
@@ -56,7 +71,7 @@ def reproduce(
     answers, main = [], {}
     for division in divisions:
         folder = out / division.replace(" ", "_")
-        tables = carry_out_parts(studies(plants, robots, division), folder, how)
+        tables = carry_out_parts(studies(plants, robots, division, mismatch), folder, how)
         answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
         main[division] = tables[MAIN]
         manifest = results.read_manifest(folder / MAIN)

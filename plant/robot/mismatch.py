@@ -1,6 +1,6 @@
 """Named, seeded deviations of the true robot from the nominal model that controllers know.
 
-A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
+A mismatch is written as words joined by `+`: a profile (a key of `PROFILES`), single axes with a
 magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
 `camera_move=90deg`; of cameras in pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
 `mount=5deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file (`factory=FILE`;
@@ -344,7 +344,12 @@ PROFILES: Final[dict[str, dict[str, float]]] = {
     "factory": {},
     "moderate": _profile(0.05, 3.0, 15.0, 0.02, 5.0),
     "severe": _profile(0.1, 6.0, 45.0, 0.04, 10.0),
+    "lab": _profile(0.008, 0.1, 8.0, 0.01, 2.0) | {"mount": radians(8.0)},
 }
+PROFILE_SETTINGS: Final[dict[str, dict[str, float]]] = {
+    "lab": {"command_delay": 0.005, "lag": 0.03, "sensing.latency": 0.095, "sensing.feature_noise": 0.0034}
+}
+"""Defaults of plants that come with a profile, by dotted key [s, m]; sources of all numbers are in docs/plants.md."""
 USUAL_SHARE: Final = 0.3  # [1] beyond which a share without a unit is likely one of percent
 
 

@@ -227,6 +227,15 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
     assert names == {f"{name}:published" for name in METHODS}
 
 
+def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(monkeypatch, capsys, tmp_path):
+    made = studies(["kinematic"], 6, mismatch="lab")
+    assert all("-lab-" in cell.request.run_id for study in made.values() for cell in study.cells)
+    wrong = ("claims", "--plants", "kinematic", "--seeds", "6", "--mismatch", "labs", "--out", str(tmp_path / "out"))
+    assert servobench(monkeypatch, *wrong) == 2
+    assert "lab" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_every_answer_is_in_the_tables_and_has_a_figure(tmp_path):
     answers = answer_all(tables(), "kinematic")
     assert len(answers) == 9

@@ -13,6 +13,7 @@ from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
 
 
@@ -110,3 +111,31 @@ def test_a_competitor_does_not():
 @pytest.mark.parametrize(("period", "rows"), [(0.1, 5), (0.05, 10), (0.02, 25), (0.008, 63), (0.004, 125)])
 def test_the_preview_is_as_long_at_every_rate(period, rows):
     assert knowledge_of("kinematic", False, {}, period=period).preview == rows
+
+
+def in_lab(plant, settings=None, mismatch="lab", varied=()):
+    request = RunRequest(plant, "constant", "random", Mismatch.parse(mismatch), 0, varied)
+    return resolve(request, Settings(settings or {})).plant
+
+
+def test_a_profile_of_a_laboratory_brings_delays_and_noise_where_the_plant_has_them():
+    config = in_lab("kinematic")
+    assert (config.command_delay, config.lag, config.sensing.latency) == (0.005, 0.03, 0.095)
+    assert config.sensing.feature_noise == 0.0034
+    assert in_lab("fmu").command_delay == 0.005
+    assert in_lab("kinematic", mismatch="moderate") == KinematicConfig()
+
+
+@NEEDS_BULLET
+def test_features_of_images_keep_their_own_noise_in_a_laboratory():
+    config = in_lab("bullet")
+    assert (config.lag, config.sensing.latency, config.sensing.feature_noise) == (0.03, 0.095, 0.0)
+
+
+def test_settings_of_the_user_and_varied_ones_go_before_those_of_a_profile():
+    given = {"kinematic": {"sensing": {"latency": 0.009}}}
+    assert in_lab("kinematic", given).sensing.latency == 0.009
+    assert in_lab("kinematic", given).lag == 0.03
+    varied = (("plant.sensing.latency", 0.13),)
+    assert in_lab("kinematic", varied=varied).sensing.latency == 0.13
+    assert in_lab("kinematic", mismatch="lab+lost_frames=10%").sensing.drop_probability == 0.1
