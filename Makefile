@@ -7,9 +7,12 @@ NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
 .PHONY: run check test results nightly golden lint format tables docs release benchmark lock clean
 
+# The first table within a minute, and then runs on rendered images with a report; its path is the last line.
+COMPARE := $(BIN)/servobench compare \
+  --controllers regression_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 run: $(VENV)/ready
-	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
-	  --controllers regression_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
+	$(COMPARE) --plants fmu --no-figures --no-report
+	$(COMPARE) --plants bullet,fmu --tasks exp2,circle
 
 # For every save: half a minute, without the tests that are marked slow.
 check: lint
@@ -76,10 +79,14 @@ benchmark: $(VENV)/ready
 $(VENV)/ready: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "servobench needs Python 3.11 or newer; name one with make PYTHON=...")'
 	@test -d .package/servobench/plant || { echo "git wrote the links in .package/servobench as text files: clone under Linux, macOS or WSL, or with git -c core.symlinks=true clone"; exit 2; }
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
-	touch $@
+	@echo "installing, 1 of 3: an environment in $(VENV)"
+	@$(PYTHON) -m venv $(VENV) && date +%s > $(VENV)/began
+	@echo "installing, 2 of 3: the packages of requirements.lock, a minute or two"
+	@$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	@echo "installing, 3 of 3: servobench"
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@echo "installed in $$(($$(date +%s) - $$(cat $(VENV)/began))) s"
+	@touch $@
 
 # Renew the lock; it holds hashes and no address of an index (needs uv: pip install uv).
 lock:
