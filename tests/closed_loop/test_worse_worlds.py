@@ -16,7 +16,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 
 NEVER = math.nan
-SEEDS = (704, 707)  # whose settling times four kinds of processors give alike
+SEEDS = (704, 707)  # whose settling times five kinds of processors give alike to a period or a hundredth
 METHODS = ("regression_mfac", "rbfnn_mfac:published", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published")
 # mismatch, latency [s], duration [s], and for each of METHODS the settling times of SEEDS [s]
 WORLDS = {
@@ -56,4 +56,4 @@ def test_methods_settle_as_soon_as_they_did(world, controller):
         request = RunRequest("kinematic", controller, "random", mismatch, seed, {"latency": latency})
         came.append(run_experiment(request, settings, steps=False).row["settling_time_s"])
     one_period = 1.001 * RunSettings().period
-    assert came == pytest.approx(wanted[METHODS.index(controller)], abs=one_period, rel=0, nan_ok=True)
+    assert came == pytest.approx(wanted[METHODS.index(controller)], abs=one_period, rel=0.01, nan_ok=True)

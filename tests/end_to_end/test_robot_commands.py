@@ -78,7 +78,7 @@ def test_a_rendered_arm_settles_and_can_be_shown(name, request):
     robot = name if name == "panda" else request.getfixturevalue(name)
     result = run_experiment(RunRequest("bullet", "regression_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
     assert (result.row["outcome"], result.row["reason"]) == ("settled", "")
-    shown = logged_run(result.row, result.steps, {})
+    shown = logged_run(result.row, result.steps)
     with Replay(shown) as replay:
         replay.place(0)
         first = replay.overview([])

@@ -107,7 +107,7 @@ def test_a_folder_is_resumed_with_the_same_camera_only(monkeypatch, capsys):
 
 def test_a_run_is_shown_through_its_camera():
     result = run_experiment(request(sensing="position", robot="ur10e with planned.toml"), Settings())
-    shown = logged_run(result.row, result.steps, {})
+    shown = logged_run(result.row, result.steps)
     assert shown.robot.pinhole.width == 640
     np.testing.assert_allclose(shown.ball[-1], shown.reference[-1], atol=0.01)
 

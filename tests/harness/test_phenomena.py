@@ -43,4 +43,4 @@ def test_a_run_under_a_turning_camera_is_not_filmed():
     request = RunRequest("kinematic", "regression_mfac", "circle", Mismatch.parse("moderate+camera_turn=15deg"), 3)
     result = run_experiment(request, Settings())
     with pytest.raises(ConfigurationError, match="cannot be shown: films have no camera that turns"):
-        logged_run(result.row, result.steps, {})
+        logged_run(result.row, result.steps)
