@@ -1,4 +1,4 @@
-"""The commands for a controller or a plant of your own, `servobench new | check | shadow`."""
+"""The commands for a controller, a plant or a log of your own, `servobench new | check | shadow | identify`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -19,7 +19,13 @@ from servobench.harness.cli.terminal import FAILED, console, print_tables, say, 
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically, write_csv
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from servobench.harness.run.resolution import ResolvedRun
+
 TEMPLATES: Final = "servobench.harness.cli"
+IDENTIFYING: Final = "constant"  # a controller, which identification does not run
 PREFIX: Final = "test_"
 NEXT: Final = {  # kind of a new file -> the next commands
     "controller": ("check {}", "run --controller {} --plant kinematic"),
@@ -127,29 +133,14 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
     """
-    from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.config.registry import choose_controller, find_controller
     from servobench.harness.run.shadow import differences, has_commands, predictions
     from servobench.harness.run.shadow import shadow as see
 
-    if not log.exists():
-        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
-    if out is not None and out.exists() and out.samefile(log):
-        raise ConfigurationError(f"--out {out} is the log itself; name another file")
     chosen = None if controller is None else choose_controller(controller)
-    if log.is_dir():
-        resolved, table = logged_in_folder(log, run, chosen, sensing)
-        for word, given, usual in (("robot", robot, "ur5"), ("sensing", sensing, "position")):
-            if given not in (usual, own := getattr(resolved.request, word)):
-                raise ConfigurationError(f"--{word} {given} is not that of the run, {own}; leave it out for a folder")
-    elif run is not None:
-        raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
-    elif chosen is None:
-        raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
-    elif find_controller(chosen).needs_truth:
+    if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
         raise ConfigurationError(f"controller {chosen} is given the true robot, which {log} does not have")
-    else:
-        resolved, table = logged_in_file(log, chosen, robot, sensing)
+    resolved, table = _logged(log, run, chosen, (robot, sensing), out)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     name, ahead = resolved.request.controller, predictions(seen)
@@ -165,3 +156,69 @@ def shadow(
     tables += [(f"Features one frame ahead, by the Jacobian of {name}", ahead)] * (not ahead.empty)
     words = [(title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}")) for title, rows in tables]
     print_tables(words, LEGEND)
+
+
+def identify(
+    log: Annotated[
+        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
+    ],
+    run: options.RunIdOption = None,
+    robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
+    out: Annotated[Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")] = None,
+) -> None:
+    """Identify a robot, its camera and its drive from a log, as a twin with intervals.
+
+    A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
+    """
+    from servobench.harness.run.experiment import build
+    from servobench.harness.run.identification import command_response, read_log
+    from servobench.harness.run.preflight import mistakes
+    from servobench.harness.run.request import find_sensing
+    from servobench.harness.run.twin_file import estimates, remarks, twin_text
+    from servobench.plant.robot.catalogue import ROBOTS, find_robot
+
+    resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+    request = resolved.request
+    experiment = build(resolved)
+    rows = read_log(experiment.plant.spec, table)
+    experiment.plant.close()
+    setup, own = find_sensing(request.sensing), find_robot(request.robot)
+    same = [name for name in ROBOTS if name != request.robot and find_robot(name).n == own.n]
+    with console.status(f"identifying {request.robot} in {len(table)} rows"):
+        mistake, found = mistakes(rows, setup.nominal(own), {name: setup.nominal(find_robot(name)) for name in same})
+        response = command_response(rows)
+    if found is None:
+        say(f"{log}: {mistake}")
+        sys.exit(FAILED)
+    print_tables([(f"{log} against a {own.title}, where they differ", estimates(found, response))])
+    for line in remarks(rows, found, response):
+        say(line)
+    if out is not None:
+        with writing(out):
+            text = twin_text(found, rows, response, (request.robot, request.sensing))
+            write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
+        say(f"twin in {out}; the next command: servobench compare --robot {out} --plants kinematic")
+
+
+def _logged(
+    log: Path, run: str | None, controller: str | None, named: tuple[str, str], out: Path | None
+) -> tuple[ResolvedRun, DataFrame]:
+    """Return a run of a controller, None for that of the log, with robot and sensing as named, and the log's rows."""
+    from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+
+    if not log.exists():
+        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
+    if out is not None and out.exists() and out.samefile(log):
+        raise ConfigurationError(f"--out {out} is the log itself; name another file")
+    if log.is_dir():
+        resolved, table = logged_in_folder(log, run, controller, named[1])
+        for word, given, usual in (("robot", named[0], "ur5"), ("sensing", named[1], "position")):
+            if given not in (usual, own := getattr(resolved.request, word)):
+                raise ConfigurationError(f"--{word} {given} is not that of the run, {own}; leave it out for a folder")
+        return resolved, table
+    if run is not None:
+        raise ConfigurationError(f"--run names a run of a results folder, and {log} is a table")
+    if controller is None:
+        raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
+    return logged_in_file(log, controller, *named)

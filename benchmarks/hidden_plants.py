@@ -1,0 +1,111 @@
+"""Identify hidden plants from 60 s of log each: coverage of intervals by parameter, latency, false alarms.
+
+python benchmarks/hidden_plants.py --plant kinematic --robots 200 --first 81000
+"""
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import servobench
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import build, draw_robot
+from servobench.harness.run.identification import command_response, read_log
+from servobench.harness.run.preflight import mistakes
+from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.resolution import resolve
+from servobench.plant.robot.catalogue import ROBOTS, find_robot
+from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.twin import TOOL, parameter_names
+
+ARMS = ("ur5", "ur10e", "panda")
+MISMATCHES = ("moderate", "moderate+gear_ratio=3%", "severe", "severe+gear_ratio=5%")
+
+
+def parameters(true: RobotModel, nominal: RobotModel) -> dict[str, float]:
+    """Return the deviations of gears, zeros, lengths and tool by their names."""
+    names, values = nominal.arm.joint_names, dict(zip(TOOL, (true.arm.tool - nominal.arm.tool).tolist(), strict=True))
+    gears = true.arm.gear_ratio / nominal.arm.gear_ratio - 1.0
+    zeros = true.arm.joint_offset - nominal.arm.joint_offset
+    for kind, each in (("gear", gears), ("zero", zeros)):
+        values |= {f"{kind}_{name}": value for name, value in zip(names, each.tolist(), strict=True)}
+    for name in parameter_names(nominal.arm):
+        if name.startswith("link"):
+            row, axis = int(name.split("_")[1]), "xyz".index(name[-1])
+            values[name] = true.arm.translation[row, axis] / nominal.arm.translation[row, axis] - 1.0
+    return values
+
+
+def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
+    """Identify one hidden plant, and return a row a parameter."""
+    draws = np.random.default_rng(seed)
+    robot, mismatch = str(draws.choice(ARMS)), str(draws.choice(MISMATCHES))
+    latency, delay, lag = (round(float(draws.uniform(0.0, most)), 3) for most in (0.13, 0.06, 0.1))
+    shape = np.diag(draws.uniform(0.5, 2.0, 3))
+    sections: dict[str, Any] = {"sensing": {"latency": latency, "noise_shape": shape.tolist()}, "command_delay": delay}
+    sections |= {"lag": max(lag, 0.01)} if plant == "kinematic" else {"scenery": False}
+    settings = {plant: sections, "random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
+    chosen: dict[str, Any] = {"robot": robot, "mismatch": mismatch, "seed": seed}
+    made = servobench.run("docs/examples/excite.py", plant, task="random", settings=settings, **chosen)
+    about: dict[str, Any] = {"seed": seed, "robot": robot, "mismatch": mismatch, "rows": len(made.steps)}
+    if made.row["status"] != "completed":
+        return [about | {"parameter": "", "said": f"the run ended: {made.row['reason']}"}]
+    request = RunRequest(plant, "constant", "random", read_mismatch(mismatch), seed, robot=robot)
+    experiment = build(resolve(request, Settings(settings | {})))
+    log, nominal = read_log(experiment.plant.spec, made.steps), find_sensing("position").nominal(find_robot(robot))
+    experiment.plant.close()
+    others = {name: find_robot(name).nominal for name in ROBOTS if name != robot and find_robot(name).n == log.spec.n}
+    began = time.perf_counter()
+    said, found = mistakes(log, nominal, others)
+    response = command_response(log)
+    about |= {"seconds": time.perf_counter() - began, "said": said}
+    rows = []
+    true = parameters(draw_robot(request)[0], nominal) | {"latency": latency}
+    if response is not None:
+        errors, sizes = (
+            (response.delay - delay, response.lag - sections.get("lag", np.nan)),
+            np.sqrt(np.diag(response.covariance)),
+        )
+        for name, error, size in zip(("command_delay", "lag"), errors, np.maximum(sizes, 1e-4), strict=True):
+            rows.append(about | {"parameter": name, "error": error, "deviation": size, "told": True})
+    for k, name in enumerate(found.names if found is not None else ()):
+        if name in true:
+            error = found.values[k] - true[name]
+            rows.append(
+                about
+                | {"parameter": name, "error": error, "deviation": found.deviations[k], "told": bool(found.told[k])}
+            )
+    return rows or [about | {"parameter": ""}]
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plant", default="kinematic")
+    parser.add_argument("--robots", type=int, default=200)
+    parser.add_argument("--first", type=int, default=81000)
+    given = parser.parse_args()
+    table = pd.DataFrame(
+        [row for seed in range(given.first, given.first + given.robots) for row in hidden(seed, given.plant)]
+    )
+    runs = table.drop_duplicates("seed")
+    print(f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log")
+    print(runs.loc[runs["said"] != "", ["seed", "robot", "mismatch", "said"]].to_string())
+    late = table[table["parameter"] == "latency"]
+    print(
+        f"latency within 5 ms: {(late['error'].abs() < 0.005).mean():.1%}, largest error {late['error'].abs().max():.4f} s"
+    )
+    told = table[table["told"].fillna(False).astype(bool)]
+    told = told.assign(covered=told["error"].abs() <= 1.96 * told["deviation"])
+    own = told[~told["parameter"].isin(["command_delay", "lag"])]
+    print(f"pooled coverage of 95 %: {own['covered'].mean():.1%} of {len(own)}")
+    by = told.groupby("parameter")
+    print(pd.DataFrame({"logs": by.size(), "covered": by["covered"].mean(), "median deviation": by["deviation"].median(),
+                        "RMS error": by["error"].apply(lambda e: np.sqrt(np.mean(e**2)))}).to_string())  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

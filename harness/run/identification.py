@@ -1,0 +1,383 @@
+"""A robot identified from a log of its joints and features, with the uncertainty of each parameter.
+
+The parameters θ of a twin (`servobench.plant.robot.twin`) deviate the nominal robot; the feature of the frame that
+arrives at t_k, exposed a latency L before, and the joint motion under commands u that act after a delay d are
+
+    y_k = h(q(t_k − L); θ) + ν_k,   ν ~ N(0, Σ)          τ v̇ = u(t − d) − v,   q(t_{k+1}) − q(t_k) = ∫ v dt
+
+with q a cubic spline through the logged positions. θ minimises Σ ρ(‖Σ^{-1/2} ν_k‖²) + Σ (θ_i/s_i)², with a soft L1 loss
+ρ while Σ and the outliers are found, and none at last for the frames that are left. s_i are wide priors (`PRIORS`), so
+that directions of θ that no frame tells (the zero of the first joint turns the arm as a turn of the camera does) stay
+at the nominal robot. The posterior is N(θ, c (JᵀΣ⁻¹J/f + S⁻²)⁻¹), where f is the correlation time of the residuals.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import numbers_of
+from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
+from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.twin import LENS, deviated, parameter_names
+
+MAX_LATENCY: Final = 0.25  # [s]
+LATENCY_STEP: Final = 0.0125  # [s] of the first search
+MAX_LAG: Final = 0.5  # [s] of commands and joints
+MIN_FRAMES: Final = 50
+MAX_FRAMES: Final = 6000
+PRIORS: Final = {  # standard deviations by the begin of a parameter's name
+    "latency": 0.1, "camera_turn": 1.0, "camera": 1.0, "tool": 0.05, "focal": 0.1, "centre": 20.0, "distortion": 0.2,
+    "gear": 0.1, "zero": 0.2, "link": 0.1,
+}  # fmt: skip
+TOLD: Final = 1.2  # [1] growth of a deviation with a prior of twice the width, below which the log tells a parameter
+TOLD_SHARE: Final = 0.5  # [1] of its prior deviation, below which a direction is drawn from
+OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
+FITS: Final = 4
+MAX_LAGS: Final = 100  # [frames] of the correlation time
+
+
+class Log(NamedTuple):
+    """Rows of a log."""
+
+    spec: PlantSpec
+    time: FloatArray  # (k,) [s]
+    joints: FloatArray  # (k, n) [rad]
+    features: FloatArray  # (k, m) [unit of the feature]
+    valid: BoolArray  # (k,) of rows with a new frame
+    commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
+
+
+def read_log(spec: PlantSpec, table: pd.DataFrame) -> Log:
+    """Return the rows of a table with columns as `steps.parquet` has them, `spec.period` apart.
+
+    Raises:
+        ConfigurationError: a column or a number is missing, or too few frames are valid.
+    """
+    names, rows = column_names(spec), np.arange(len(table))
+    joints, features = (numbers_of("the log", table, names[each]) for each in ("joint_position", "feature"))
+    valid = np.ones(len(table), dtype=np.bool_)
+    if "feature_valid" in table:
+        valid = numbers_of("the log", table, ["feature_valid"])[:, 0] != 0.0
+    known = set(names[COMMAND]) <= set(table)
+    commands = numbers_of("the log", table, names[COMMAND]) if known else None
+    log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
+    if len(frames := frames_of(log)) < MIN_FRAMES:
+        raise ConfigurationError(
+            f"the log has {len(frames)} valid frames after the first {MAX_LATENCY:g} s; wanted {MIN_FRAMES} or more"
+        )
+    return log
+
+
+def frames_of(log: Log) -> Any:  # noqa: ANN401 - of indices
+    """Return the rows of frames that were exposed within the log at any latency."""
+    return np.flatnonzero(log.valid & (log.time >= log.time[0] + MAX_LATENCY))
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A robot identified from a log.
+
+    Attributes:
+        names: of the parameters.
+        values: θ, (p,), for the camera the difference from its nominal pose.
+        covariance: of the posterior, (p, p).
+        told: which parameters the log tells, (p,).
+        factor: (d, p), whose rows are the directions that the log tells; factorᵀ factor is their covariance.
+        untold: (e, p), directions of θ that it does not tell, of length 1 in units of the priors.
+        pose: of the camera at θ, (4, 4).
+        noise: Σ, (m, m).
+        residuals: of all valid frames, (k, m).
+        rows: of these frames in the log, (k,).
+        inliers: which of them are no outliers, (k,).
+        correlation: f [frames].
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    covariance: FloatArray
+    told: BoolArray
+    factor: FloatArray
+    untold: FloatArray
+    pose: FloatArray
+    noise: FloatArray
+    residuals: FloatArray
+    rows: Any
+    inliers: BoolArray
+    correlation: float
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Standard deviations of the parameters, (p,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def model(self, nominal: RobotModel) -> RobotModel:
+        """Return the robot at θ, given the nominal one."""
+        values = dict(zip(self.names, self.values.tolist(), strict=True))
+        deviating = {name: value for name, value in values.items() if not name.startswith("camera")}
+        return deviated(nominal.with_camera(self.pose), deviating)
+
+    def errors(self, log: Log, nominal: RobotModel) -> FloatArray:
+        """Return the residuals of all valid frames of a log after the longest latency, (k, m)."""
+        rows, latency = frames_of(log), self.values[self.names.index("latency")]
+        features = np.asarray(self.model(nominal).feature(motion(log)(log.time[rows] - latency)))
+        return np.asarray(log.features[rows] - features)
+
+
+def motion(log: Log) -> Any:  # noqa: ANN401 - of SciPy
+    """Return the joint positions of a log as a function of time."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - a quarter of a second
+
+    return CubicSpline(log.time, log.joints)
+
+
+def kind_of(name: str) -> str:
+    """Return the begin of a parameter's name, by which it has its unit and its prior."""
+    return "camera_turn" if name.startswith("camera_turn") else name.partition("_")[0]
+
+
+def prior(name: str) -> float:
+    """Return the standard deviation of a parameter before any log."""
+    return PRIORS[kind_of(name)]
+
+
+class _Problem:
+    """Residuals of the valid frames of a log as a function of z = θ / s."""
+
+    def __init__(self, log: Log, model: RobotModel, most: int) -> None:
+        self.rows = frames_of(log)
+        self.rows = self.rows[:: -(-len(self.rows) // most)]
+        self.time, self.y = log.time[self.rows], log.features[self.rows]
+        self.motion = motion(log)
+        lens: tuple[str, ...] = () if isinstance(model, SetupModel) and model.setup.name == PIXEL.name else LENS
+        self.names = tuple(each for each in parameter_names(model.arm) if each not in ("command_delay", "lag", *lens))
+        self.scale = np.array([prior(name) for name in self.names])
+        self.nominal = np.asarray(model.camera)
+        self._of_camera = np.array([name.startswith("camera") for name in self.names])
+        self.model, self.latency, self.spread = self._placed(model)
+
+    def _placed(self, model: RobotModel) -> tuple[RobotModel, float, float]:
+        """Return a model whose camera is where it fits best, the latency of this fit, and its median error."""
+        tried = []
+        for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP):
+            pose = camera_pose(model, self.motion(self.time - latency), self.y)
+            placed = model.with_camera(pose)
+            error = np.asarray(placed.feature(self.motion(self.time - latency))) - self.y
+            tried.append((float(np.median(np.linalg.norm(error, axis=1))), float(latency), placed))
+        spread, latency, placed = min(tried, key=lambda each: each[0])
+        return placed, latency, spread
+
+    def values(self, z: FloatArray) -> dict[str, float]:
+        """Return θ by name."""
+        return dict(zip(self.names, (self.scale * z).tolist(), strict=True))
+
+    def errors(self, z: FloatArray) -> FloatArray:
+        """Return y − h, (k, m)."""
+        values = self.values(z)
+        q = self.motion(self.time - values["latency"])
+        return np.asarray(self.y - np.asarray(deviated(self.model, values).feature(q)))
+
+    def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return residuals with their weights (k,) and Σ^{-1/2}, and z for its prior."""
+        return np.concatenate([(weights[:, None] * self.errors(z) @ root.T).ravel(), z])
+
+    def pose(self, z: FloatArray) -> FloatArray:
+        """Return the pose of the camera, (4, 4)."""
+        return np.asarray(deviated(self.model, self.values(z)).camera)
+
+    def recentred(self, z: FloatArray) -> FloatArray:
+        """Take the pose of the camera for that from which it deviates, and return the z that is left."""
+        self.model = self.model.with_camera(self.pose(z))
+        return np.asarray(z * ~self._of_camera)
+
+    def differences(self, z: FloatArray) -> FloatArray:
+        """Return θ, for the camera the difference from its nominal pose in the same form."""
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - as above
+
+        values, pose = self.scale * z, self.pose(z)
+        turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
+        values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
+        return values
+
+    def start(self) -> FloatArray:
+        """Return the z of the first search."""
+        z = np.zeros(len(self.names))
+        z[self.names.index("latency")] = self.latency / prior("latency")
+        return z
+
+
+def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> FloatArray:
+    """Return the pose of a fixed camera, (4, 4), that explains features best at joint positions, robustly.
+
+    Args:
+        model: nominal robot with one camera.
+        joints: (k, n) [rad].
+        features: (k, 3) m, places of the ball, or (k, 2) px, its pixels.
+    """
+    pose = np.eye(4)
+    if isinstance(model, SetupModel) and model.setup.name == PIXEL.name:
+        import cv2  # noqa: PLC0415 - a tenth of a second
+
+        matrix = np.eye(3)
+        matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
+        points = np.ascontiguousarray(model.points(joints)[:, 0])
+        found, turn, place, _ = cv2.solvePnPRansac(points, features.copy(), matrix, None, reprojectionError=20.0)
+        if not found:
+            return np.asarray(model.camera)
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
+        return np.asarray(np.linalg.inv(pose))
+    points, weights = model.arm.ball_position(joints), np.ones(len(joints))
+    for _ in range(8):  # Kabsch's rotation with the weights of Weiszfeld's median
+        share = weights / weights.sum()
+        middle, mean = share @ points, share @ features
+        U, _, V = np.linalg.svd((points - middle).T @ ((features - mean) * share[:, None]))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+        pose[:3, :3], pose[:3, 3] = R, middle - R @ mean
+        distance = np.linalg.norm(features - (points - pose[:3, 3]) @ R, axis=1)
+        weights = 1.0 / np.maximum(distance, np.median(distance) + 1e-9)
+    return pose
+
+
+def identify(log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FITS) -> Identified:
+    """Identify a robot from a log.
+
+    Args:
+        log: of a robot with one fixed camera.
+        model: nominal robot under the sensing of the log, position or pixel.
+        most: frames that are used, at equal distances.
+        fits: number of fits, the last without a robust loss.
+
+    Raises:
+        ConfigurationError: another sensing.
+    """
+    from scipy.optimize import least_squares  # noqa: PLC0415 - half a second
+
+    sensing = model.setup.name if isinstance(model, SetupModel) else POSITION.name
+    if sensing not in (POSITION.name, PIXEL.name) or (isinstance(model, SetupModel) and model.mount != "fixed"):
+        raise ConfigurationError(
+            f"identify takes logs with --sensing position or pixel, of a fixed camera; got {sensing}"
+        )
+    problem = _Problem(log, model, most)
+    inliers = np.ones(len(problem.rows), dtype=np.bool_)
+    noise, z = np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2, problem.start()
+    for left in reversed(range(fits)):
+        root, z = np.linalg.inv(np.linalg.cholesky(noise)), problem.recentred(z)
+        distances = np.sum((problem.errors(z) @ root.T) ** 2, axis=1)
+        weights = np.asarray((1.0 + distances) ** -0.25 if left else inliers, dtype=np.float64)
+        solved: Any = least_squares(
+            partial(problem.weighted, root=root, weights=weights),
+            z, method="lm", max_nfev=5 * fits * len(z), ftol=1e-6, xtol=1e-6,
+        )  # fmt: skip
+        z = solved.x
+        noise, inliers = robust_covariance(problem.errors(z))
+    return _posterior(problem, z, solved.jac[: -len(z)], noise, inliers)
+
+
+def _posterior(
+    problem: _Problem, z: FloatArray, jacobian: FloatArray, noise: FloatArray, inliers: BoolArray
+) -> Identified:
+    """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p)."""
+    errors, s, unit = problem.errors(z), problem.scale, np.eye(len(z))
+    correlation = correlation_time((errors @ np.linalg.inv(np.linalg.cholesky(noise)).T) * inliers[:, None])
+    information = jacobian.T @ jacobian / correlation
+    covariance = np.linalg.inv(information + unit)
+    wider = np.linalg.inv(information + unit / 4.0)
+    eigenvalues, directions = np.linalg.eigh(information)
+    shares = 1.0 / np.sqrt(1.0 + eigenvalues)
+    known = shares < TOLD_SHARE
+    return Identified(
+        names=problem.names,
+        values=problem.differences(z),
+        covariance=s[:, None] * covariance * s,
+        told=np.sqrt(np.diag(wider) / np.diag(covariance)) < TOLD,
+        factor=shares[known, None] * directions.T[known] * s,
+        untold=directions.T[~known],
+        pose=problem.pose(z),
+        noise=noise,
+        residuals=errors,
+        rows=problem.rows,
+        inliers=inliers,
+        correlation=correlation,
+    )
+
+
+def robust_covariance(errors: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the covariance of errors (k, m) without outliers, and which are none, (k,)."""
+    spread = 1.4826 * np.median(np.abs(errors), axis=0) + 1e-12
+    inliers = np.sum((errors / spread) ** 2, axis=1) < OUTLIER
+    for _ in range(5):
+        covariance = errors[inliers].T @ errors[inliers] / max(int(inliers.sum()), 1)
+        inliers = np.einsum("ki,ij,kj->k", errors, np.linalg.inv(covariance), errors) < OUTLIER
+    return covariance, inliers
+
+
+def correlation_time(white: FloatArray) -> float:
+    """Return 1 + 2 Σ ρ_l of white residuals (k, m) [frames], at least 1, up to the first ρ_l below 2/√k."""
+    total, square, count = 1.0, float(np.sum(white**2)), len(white)
+    for lag in range(1, min(MAX_LAGS, count // 4)):
+        share = float(np.sum(white[lag:] * white[:-lag])) / square
+        if share < 2.0 / (count * white.shape[1]) ** 0.5:
+            break
+        total += 2.0 * share
+    return total
+
+
+class Response(NamedTuple):
+    """How joints answer to commands."""
+
+    delay: float  # [s]
+    lag: float  # [s]
+    covariance: FloatArray  # of both, (2, 2)
+    unexplained: float  # [1] share of the motion
+
+
+def command_response(log: Log) -> Response | None:
+    """Return delay and lag of the joints; None for a log without commands, or without motion."""
+    from scipy.optimize import least_squares  # noqa: PLC0415 - as above
+
+    if log.commands is None or not np.ptp(log.commands, axis=0).any():
+        return None
+    spec, steps = log.spec, np.diff(log.joints, axis=0)
+    u = np.clip(log.commands, -spec.joint_velocity_limit, spec.joint_velocity_limit)
+    first = int(np.ceil(2.0 * MAX_LAG / spec.period))
+
+    def errors(times: FloatArray) -> FloatArray:
+        return (steps - joint_steps(u, spec.period, *times))[first:].ravel()
+
+    starts = [(delay, lag) for delay in np.arange(0.0, 0.2, 0.5 * spec.period) for lag in (0.02, 0.1)]
+    best = min(starts, key=lambda each: float(np.sum(errors(np.array(each)) ** 2)))
+    solved: Any = least_squares(
+        errors, best, bounds=((0.0, 1e-4), (MAX_LAG, MAX_LAG)), x_scale=0.01, diff_step=[1e-4, 1e-4]
+    )
+    left = solved.fun.reshape(-1, spec.n)
+    variance = float(np.mean(left**2)) * correlation_time(left) + 1e-16
+    covariance = variance * np.linalg.pinv(solved.jac.T @ solved.jac)
+    share = float(np.sqrt(np.mean(left**2) / np.mean(steps[first:] ** 2)))
+    return Response(float(solved.x[0]), float(solved.x[1]), covariance, share)
+
+
+def joint_steps(commands: FloatArray, period: float, delay: float, lag: float) -> FloatArray:
+    """Return the joint motions from row to row, (k − 1, n) rad, from rest, in closed form.
+
+    Args:
+        commands: u, (k, n) [rad/s], held for a period each.
+        period: [s].
+        delay: d [s].
+        lag: τ [s], above 0.
+    """
+    from scipy.signal import lfilter  # noqa: PLC0415 - as above
+
+    whole, later = divmod(delay, period)
+    rest = np.zeros((int(whole) + 1, commands.shape[1]))
+    padded = np.concatenate([rest, commands])[: len(commands)]
+    before, now = padded[:-1], np.concatenate([rest[1:], commands])[: len(commands) - 1]
+    kept, first, second = np.exp(-np.array([period, later, period - later]) / lag)
+    driven = second * (1.0 - first) * before + (1.0 - second) * now
+    v = lfilter([1.0], [1.0, -kept], driven, axis=0)
+    change = np.diff(v, axis=0, prepend=0.0)
+    return np.asarray(later * before + (period - later) * now - lag * change)

@@ -1,0 +1,235 @@
+"""Mistakes of a log that stop people: joints in another order or direction, other units, mirrored axes, clocks.
+
+A log that the robot's model explains down to its noise, with likely parameters, has none of them. Of any other log
+each mistake is undone in turn, and named where the log is explained far better without it.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from servobench.harness.run.identification import (
+    MIN_FRAMES,
+    OUTLIER,
+    Identified,
+    Log,
+    camera_pose,
+    frames_of,
+    identify,
+    motion,
+    prior,
+)
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.robot.hand_eye import RobotModel
+
+MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the nominal robot
+MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before although the arm moves
+MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
+UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
+MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
+UNLIKELY: Final = 3.0  # [1] prior deviations of a gear, zero, link or tool
+GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
+TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
+SCREENED: Final = 6  # mistakes that are looked at closely
+FRAMES: Final = 150  # frames of a close look
+DRIFT: Final = 0.01  # [s] over the log, from which a clock counts as drifting
+CERTAIN: Final = 6.0  # [1] standard deviations
+DRIFT_STEPS: Final = 4  # Newton's
+PARTS: Final = 16  # of the log, between which the camera may have moved
+JUMP: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
+
+
+class _Remedy(NamedTuple):
+    """A mistake, and the log without it."""
+
+    text: str
+    log: Log
+    model: RobotModel
+
+
+def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> tuple[str, Identified | None]:
+    """Return a line on the mistake of a log with evidence and remedy, empty for none, and else the robot.
+
+    Args:
+        log: rows.
+        model: nominal robot under the sensing of the log.
+        others: nominal models of other arms with as many joints, by name.
+    """
+    found = _units(log, model) or _repeats(log)
+    if found:
+        return found, None
+    robot = identify(log, model)
+    drift, deviation = _drift(log, robot)
+    drifts = abs(drift) > max(CERTAIN * deviation, DRIFT / float(np.ptp(log.time)))
+    if is_explained(log, robot) and not drifts:
+        return "", robot
+    found = _moved(log, model) or _undone(log, model, others)
+    return found, None if found else robot
+
+
+def noise_of(log: Log) -> FloatArray:
+    """Return the deviation of a feature's noise, (m,), from third differences of successive frames; 0 for too few."""
+    rows = frames_of(log)
+    follow = np.flatnonzero((rows[3:] - rows[:-3]) == 3 * int(np.median(np.diff(rows))))
+    if not follow.size:
+        return np.zeros(log.spec.m)
+    third = np.diff(log.features[rows], n=3, axis=0)[follow]
+    return np.asarray(1.4826 * np.median(np.abs(third), axis=0) / math.sqrt(20.0))
+
+
+def _sizes(robot: Identified) -> FloatArray:
+    """Return gears, zeros, links and tool in deviations of their priors."""
+    known = zip(robot.names, robot.values.tolist(), strict=True)
+    return np.array([value / prior(name) for name, value in known if name.startswith(("gear", "zero", "link", "tool"))])
+
+
+def is_explained(log: Log, robot: Identified) -> bool:
+    """Return whether residuals are not far above the noise, and no parameter is unlikely."""
+    spread = np.sqrt(np.diag(robot.noise))
+    size = np.std(log.features[robot.rows], axis=0).max()
+    rest = (spread > UNEXPLAINED * noise_of(log)) & (spread > MIN_SHARE * size)
+    return bool(not rest.any() and np.abs(_sizes(robot)).max() < UNLIKELY and robot.inliers.mean() > 0.5)
+
+
+def _units(log: Log, model: RobotModel) -> str:
+    """Name joints that are likely in degrees and features that are likely in mm."""
+    spec, q = log.spec, log.joints
+    beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
+    if beyond.max() > math.pi:
+        row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
+        where = f"joint {spec.joint_names[joint]} is at {q[row, joint]:.4g} rad in row {row}, far beyond its range"
+        return f"{where}: the log is likely in degrees; write joint positions in rad"
+    rows = frames_of(log)
+    moved, made = (np.linalg.norm(_spread(each)) for each in (log.features[rows], np.asarray(model.feature(q[rows]))))
+    if spec.feature.unit == "m" and moved > MAX_RATIO * made:
+        return (
+            f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m: "
+            "they are likely in mm; write them in m"
+        )
+    return ""
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+
+
+def _repeats(log: Log) -> str:
+    """Name frames that are given as new and equal the one before, although the arm moves."""
+    rows = np.flatnonzero(log.valid)
+    same = (np.diff(log.features[rows], axis=0) == 0.0).all(axis=1)
+    moving = np.abs(np.diff(log.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
+    share = float(np.mean(same[moving])) if moving.any() else 0.0
+    if share <= MAX_REPEATED:
+        return ""
+    row = int(rows[1:][same & moving][0])
+    return (
+        f"{share:.0%} of the frames repeat the one before although the arm moves, first in row {row}: "
+        "give rows without a new frame feature_valid = 0"
+    )
+
+
+def _drift(log: Log, robot: Identified) -> tuple[float, float]:
+    """Return by how much frames come later per second of the log [1], and its standard deviation."""
+    rows, kept = robot.rows, robot.inliers
+    rates = np.gradient(log.features[rows] - robot.residuals, log.time[rows], axis=0)[kept]
+    root = np.linalg.inv(np.linalg.cholesky(robot.noise))
+    since = log.time[rows][kept] - log.time.mean()
+    pull, error = -(rates @ root.T) * since[:, None], robot.residuals[kept] @ root.T
+    weight = float(np.sum(pull**2)) + 1e-12
+    return float(np.sum(pull * error)) / weight, math.sqrt(robot.correlation / weight)
+
+
+def _undrifted(log: Log, model: RobotModel) -> _Remedy:
+    """Return the log with the clock of the joints stretched such that frames are late by a constant."""
+    total, undone = 0.0, log
+    for _ in range(DRIFT_STEPS):
+        total += _drift(undone, identify(undone, model, FRAMES, fits=2))[0]
+        limits = log.time[0], log.time[-1]
+        undone = log._replace(joints=motion(log)(np.clip(log.time - total * (log.time - log.time.mean()), *limits)))
+    word = f"{1e3 * abs(total) * float(np.ptp(log.time)):.0f} ms {'later' if total > 0.0 else 'earlier'}"
+    text = f"frames come {word} at the end than at the begin, as clocks of camera and joints drift: stamp both with one"
+    return _Remedy(text, undone, model)
+
+
+def _moved(log: Log, model: RobotModel) -> str:
+    """Name a camera that was moved during the log: one half is explained, and errors of its robot jump in the other."""
+    rows = frames_of(log)
+    for half, way in ((rows[: len(rows) // 2], 1), (rows[len(rows) // 2 :], -1)):
+        part = log._replace(valid=np.isin(np.arange(len(log.time)), half))
+        if len(half) < MIN_FRAMES or not is_explained(part, robot := identify(part, model)):
+            continue
+        errors = np.linalg.norm(robot.errors(log, model), axis=1)
+        sizes = np.array([np.median(each) for each in np.array_split(errors, PARTS)])
+        growth = (sizes[1:] / sizes[:-1]) ** way
+        if growth.max() > JUMP:
+            row = rows[(int(growth.argmax()) + 1) * len(rows) // PARTS]
+            size = float(np.median(errors[(rows - row) * way >= 0]))
+            return (
+                f"features jump by {size:.2g} {log.spec.feature.unit} about {log.time[row]:.0f} s after the begin: the "
+                "camera or the ball was moved; cut the log there"
+            )
+    return ""
+
+
+def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> str:
+    """Return the mistake without which the log is explained far better, with those that cannot be told from it."""
+    rows = frames_of(log)
+    rows = rows[:: -(-len(rows) // FRAMES)]
+    noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
+
+    def quick(each: _Remedy) -> float:
+        q, y = each.log.joints[rows], each.log.features[rows]
+        placed = each.model.with_camera(camera_pose(each.model, q, y))
+        return float(np.median(np.linalg.norm(np.asarray(placed.feature(q)) - y, axis=1)))
+
+    def misfit(each: _Remedy) -> float:
+        robot = identify(each.log, each.model, FRAMES, fits=2)
+        error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
+        return float(error.sum() + np.sum(_sizes(robot) ** 2))
+
+    tried = [*sorted(_remedies(log, model, others), key=quick)[:SCREENED], _undrifted(log, model)]
+    as_it_is, misfits = misfit(_Remedy("", log, model)), [misfit(each) for each in tried]
+    best = min(misfits)
+    if best >= GAIN * as_it_is:
+        return ""
+    names = [each.text for _, each in sorted(zip(misfits, tried, strict=True), key=lambda pair: pair[0])]
+    names = names[: sum(own <= TIE * best for own in misfits)]
+    which = "; a log cannot tell which" if len(names) > 1 else ""
+    return f"{', or '.join(names)} (undone, {math.sqrt(best / as_it_is):.0%} of the error is left{which})"
+
+
+def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:
+    """Yield the log without one mistake each."""
+    q, y, names = log.joints, log.features, log.spec.joint_names
+    n = len(names)
+
+    def joints(text: str, changed: FloatArray) -> _Remedy:
+        return _Remedy(text, log._replace(joints=changed), model)
+
+    for i, j in combinations(range(n), 2):
+        order = np.arange(n)
+        order[[i, j]] = j, i
+        yield joints(f"joints {names[i]} and {names[j]} are exchanged", q[:, order])
+    alphabetical = np.argsort(np.argsort(names))
+    yield joints("joints are in alphabetical order, as in ROS", q[:, alphabetical])
+    yield joints("joints are in reverse order", q[:, ::-1])
+    for i, name in enumerate(names):
+        yield joints(f"the direction of joint {name} is reversed", q * np.where(np.arange(n) == i, -1.0, 1.0))
+        for turn in (90, -90, 180):
+            offset = np.where(np.arange(n) == i, math.radians(turn), 0.0)
+            yield joints(f"the zero of joint {name} is {turn}° off", q + offset)
+    if log.spec.feature.unit == "m":
+        yield _Remedy(
+            "an axis of the camera is mirrored, or two are exchanged", log._replace(features=y * (1, 1, -1)), model
+        )
+    else:
+        size = 2.0 * np.median(y, axis=0)
+        yield _Remedy(
+            "an axis of the image is mirrored", log._replace(features=(size - y) * (1, 0) + y * (0, 1)), model
+        )
+        yield _Remedy("u and v are exchanged", log._replace(features=y[:, ::-1]), model)
+    for name, other in others.items():
+        yield _Remedy(f"the arm is a {name}", log, other)

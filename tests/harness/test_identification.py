@@ -1,0 +1,279 @@
+"""Robots identified from logs of plants whose truth is known, and mistakes of logs that are named."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from kit.command import servobench
+from servobench import run
+from servobench.harness.run.experiment import draw_robot
+from servobench.harness.run.identification import (
+    camera_pose,
+    command_response,
+    correlation_time,
+    identify,
+    joint_steps,
+    read_log,
+    robust_covariance,
+)
+from servobench.harness.run.preflight import mistakes
+from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
+from servobench.harness.run.twin_file import estimates, remarks, twin_text
+from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.hand_eye import hand_eye_spec
+
+LATENCY, DELAY, LAG = 0.08, 0.03, 0.07
+SETTINGS = {
+    "kinematic": {"sensing": {"latency": LATENCY}, "command_delay": DELAY, "lag": LAG},
+    "random": {"duration": 20.0},
+}
+ROBOT, MISMATCH, SEED = "ur10e", "severe+gear_ratio=5%", 3
+ELBOW = 2
+
+
+@cache
+def logged(sensing="position", seed=SEED):
+    """Return the log of a run with excited joints, its table and the nominal model."""
+    made = run("docs/examples/excite.py", task="random", robot=ROBOT, mismatch=MISMATCH, seed=seed, sensing=sensing,
+               settings=SETTINGS)  # fmt: skip
+    model = find_sensing(sensing).nominal(find_robot(ROBOT))
+    return read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * math.pi), made.steps), made.steps, model
+
+
+@cache
+def identified(sensing="position", seed=SEED):
+    log, _, model = logged(sensing, seed)
+    return identify(log, model)
+
+
+def true_robot(seed=SEED):
+    return draw_robot(RunRequest("kinematic", "constant", "random", read_mismatch(MISMATCH), seed, robot=ROBOT))[0]
+
+
+def truth(seed=SEED):
+    """Return the true parameters that a log can tell."""
+    true, nominal = true_robot(seed), find_robot(ROBOT).nominal
+    names = nominal.arm.joint_names
+    values = {f"gear_{name}": true.arm.gear_ratio[i] - 1.0 for i, name in enumerate(names)}
+    values |= {f"zero_{name}": true.arm.joint_offset[i] - nominal.arm.joint_offset[i] for i, name in enumerate(names)}
+    for row, axis in ((2, 0), (3, 0), (4, 2), (5, 2)):
+        share = true.arm.translation[row, axis] / nominal.arm.translation[row, axis] - 1.0
+        values[f"link_{row}_{'xyz'[axis]}"] = share
+    return values | {"latency": LATENCY}
+
+
+@pytest.mark.parametrize("sensing", ["position", "pixel"])
+def test_parameters_lie_where_the_posterior_says(sensing):
+    robot, true = identified(sensing), truth()
+    rows = zip(robot.names, robot.values, robot.deviations, robot.told, strict=True)
+    told = {name: (value, deviation) for name, value, deviation, own in rows if own and name in true}
+    assert {"latency", "gear_shoulder_pan", "gear_elbow", "zero_elbow", "zero_wrist_1"} <= set(told)
+    scores = np.array([(value - true[name]) / deviation for name, (value, deviation) in told.items()])
+    assert np.sum(scores**2) < chi2.ppf(0.999, len(scores))
+    assert told["latency"][0] == pytest.approx(LATENCY, abs=0.005)
+    assert told["gear_elbow"][1] < 0.02
+
+
+def test_first_zero_and_camera_are_not_told_apart():
+    robot = identified()
+    told = dict(zip(robot.names, robot.told.tolist(), strict=True))
+    assert not told["zero_shoulder_pan"]
+    assert not told["camera_turn_z"]
+    pan = robot.untold[:, robot.names.index("zero_shoulder_pan")]
+    assert np.sum(pan**2) > 0.5
+
+
+def test_features_of_another_motion_are_predicted():
+    log, _, model = logged(seed=SEED)
+    true = true_robot()
+    robot = identified().model(model)
+    rng = np.random.default_rng(1)
+    q = log.joints[rng.integers(0, len(log.joints), 50)] + rng.uniform(-0.1, 0.1, (50, 6))
+    assert np.abs(robot.feature(q) - true.feature(q)).max() < 0.003
+    assert np.abs(model.feature(q) - true.feature(q)).max() > 0.05
+
+
+def test_delay_and_lag_are_those_of_the_drive():
+    log, _, _ = logged()
+    response = command_response(log)
+    assert (response.delay, response.lag) == pytest.approx((DELAY, LAG), abs=1e-5)
+    assert response.unexplained < 1e-3
+    assert command_response(log._replace(commands=None)) is None
+
+
+def test_joint_steps_are_the_integral_of_the_lag():
+    period, delay, lag, fine = 0.05, 0.07, 0.11, 1000
+    u = np.array([[1.0], [0.0], [-2.0], [0.5], [0.0], [0.0]])
+    h = period / fine
+    held = np.concatenate([np.zeros(round(delay / h)), np.repeat(u[:, 0], fine)])[: fine * len(u)]
+    q, v, at = 0.0, 0.0, [0.0]
+    for k, each in enumerate(held, 1):
+        gone = -math.expm1(-h / lag)
+        q, v = q + h * each + lag * gone * (v - each), v + gone * (each - v)
+        if k % fine == 0:
+            at.append(q)
+    np.testing.assert_allclose(joint_steps(u, period, delay, lag)[:, 0], np.diff(at)[:-1], atol=1e-9)
+
+
+def test_poses_of_cameras_are_found_among_outliers():
+    rng = np.random.default_rng(0)
+    for sensing in ("position", "pixel"):
+        log, _, model = logged(sensing)
+        q = log.joints[::4]
+        wanted = model.turned(np.array([0.1, -0.2, 0.7]), (0.4, 0.1, 0.4))
+        y = np.array(wanted.feature(q))
+        y[rng.random(len(y)) < 0.2] += 50.0 if sensing == "pixel" else 0.3
+        np.testing.assert_allclose(camera_pose(model, q, y), wanted.camera, atol=2e-3)
+
+
+def test_covariance_and_outliers_are_told_apart():
+    rng = np.random.default_rng(4)
+    true = np.array([[4.0, 1.0], [1.0, 2.0]])
+    errors = rng.multivariate_normal((0.0, 0.0), true, 5000)
+    errors[:1000] += 40.0
+    covariance, inliers = robust_covariance(errors)
+    np.testing.assert_allclose(covariance, true, rtol=0.1)
+    assert inliers[:1000].sum() == 0
+    assert inliers[1000:].mean() > 0.99
+
+
+def test_correlation_time_is_that_of_the_process():
+    rng, share = np.random.default_rng(5), 0.8
+    white = rng.standard_normal((20000, 1))
+    x = np.zeros_like(white)
+    for k in range(1, len(x)):
+        x[k] = share * x[k - 1] + white[k]
+    assert correlation_time(x) == pytest.approx((1 + share) / (1 - share), rel=0.15)
+    assert correlation_time(white) == 1.0
+
+
+def exchanged(log):
+    return log._replace(joints=log.joints[:, [0, 2, 1, 3, 4, 5]])
+
+
+def reversed_elbow(log):
+    return log._replace(joints=log.joints * np.where(np.arange(6) == ELBOW, -1.0, 1.0))
+
+
+def mirrored(log):
+    return log._replace(features=log.features * (1.0, -1.0, 1.0))
+
+
+def drifting(log):
+    late = 0.002 * log.time[:, None]
+    return log._replace(features=log.features - late * np.gradient(log.features, log.time, axis=0))
+
+
+def moved(log):
+    later = (log.time > 12.0)[:, None]
+    return log._replace(features=log.features + later * (0.05, 0.0, 0.0))
+
+
+def repeated(log):
+    y = log.features.copy()
+    y[3::4] = y[2::4][: len(y[3::4])]
+    return log._replace(features=y)
+
+
+MISTAKES = {
+    "exchanged": (exchanged, "joints shoulder_lift and elbow are exchanged"),
+    "reversed": (reversed_elbow, "the direction of joint elbow is reversed"),
+    "mirrored": (mirrored, "an axis of the camera is mirrored, or two are exchanged"),
+    "drifting": (drifting, r"frames come \d+ ms later at the end than at the begin"),
+    "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
+    "repeated": (repeated, r"25% of the frames repeat the one before although the arm moves, first in row \d+"),
+    "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "likely in degrees; write joint positions"),
+    "millimetres": (lambda log: log._replace(features=1e3 * log.features), "likely in mm; write them in m"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_with_its_remedy(mistake):
+    change, wanted = MISTAKES[mistake]
+    log, _, model = logged()
+    text, robot = mistakes(change(log), model, {})
+    assert re.search(wanted, text)
+    assert robot is None
+
+
+def test_another_arm_is_named():
+    log, _, _ = logged()
+    ur5e, ur10e = (find_robot(name).nominal for name in ("ur5e", "ur10e"))
+    assert "the arm is a ur10e" in mistakes(log, ur5e, {"ur10e": ur10e})[0]
+
+
+def test_outliers_and_a_joint_at_rest_are_no_mistakes():
+    log, _, model = logged()
+    rng, y = np.random.default_rng(2), log.features.copy()
+    bad = rng.random(len(y)) < 0.3
+    y[bad] += rng.normal(0.0, 0.3, (int(bad.sum()), 3))
+    text, robot = mistakes(log._replace(features=y), model, {})
+    assert text == ""
+    assert 1.0 - robot.inliers.mean() == pytest.approx(0.3, abs=0.05)
+    assert np.sqrt(np.diag(robot.noise)).max() < 0.0015
+
+
+def test_what_is_printed_names_units_and_what_the_log_does_not_tell():
+    log, _, _ = logged()
+    still = log._replace(joints=log.joints * (1, 1, 1, 1, 1, 0.0))
+    table = estimates(identified(), command_response(log)).set_index("parameter")
+    assert table.loc["latency", "unit"] == "ms"
+    assert float(table.loc["latency", "estimate"]) == pytest.approx(80.0, abs=2.0)
+    lines = "\n".join(remarks(log, identified(), None))
+    assert "residuals over time are white" in lines
+    assert "not told: zero_shoulder_pan with camera_turn_" in lines
+    assert "delay and lag of commands, as the log has none" in lines
+    assert "joints that hardly move: wrist_3" in "\n".join(remarks(still, identified(), None))
+
+
+def test_a_twin_has_the_features_and_the_uncertainty_of_the_log(tmp_path):
+    log, _, model = logged()
+    path = tmp_path / "twin.toml"
+    path.write_text(twin_text(identified(), log, command_response(log), (ROBOT, "position")), encoding="utf-8")
+    request = RunRequest("kinematic", "constant", "random", read_mismatch("none"), 0, robot=str(path))
+    mean = draw_robot(request)[0]
+    q = log.joints[::20]
+    np.testing.assert_allclose(mean.feature(q), identified().model(model).feature(q), atol=1e-9)
+    twin = find_robot(str(path)).twin
+    assert twin.times(0) == {"sensing.latency": LATENCY, "command_delay": DELAY, "lag": LAG}
+    drawn = [draw_robot(replace(request, seed=seed))[0].feature(q) for seed in range(1, 20)]
+    assert 1e-5 < np.std(drawn, axis=0).mean() < 1e-3
+
+
+def test_the_command_writes_a_twin_that_other_commands_take(tmp_path, monkeypatch, capsys):
+    _, table, _ = logged()
+    log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
+    table.drop(columns=[name for name in table if name.startswith("true_")]).to_csv(log, index=False)
+    assert servobench(monkeypatch, "identify", str(log), "--robot", ROBOT, "--out", str(out)) == 0
+    assert "gear_elbow" in capsys.readouterr().out
+    assert out.read_text(encoding="utf-8").startswith(f'robot = "{ROBOT}"')
+    row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row
+    assert row["outcome"] == "settled"
+
+
+def test_the_command_names_a_mistake_with_exit_code_1_and_writes_nothing(tmp_path, monkeypatch, capsys):
+    _, table, _ = logged()
+    log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
+    features = [name for name in table if name.startswith("feature_") and name.endswith("_m")]
+    table.assign(**{name: 1e3 * table[name] for name in features}).to_csv(log, index=False)
+    assert servobench(monkeypatch, "identify", str(log), "--robot", ROBOT, "--out", str(out)) == 1
+    assert "they are likely in mm; write them in m" in capsys.readouterr().out
+    assert not out.exists()
+
+
+def test_logs_that_are_too_short_or_of_other_cameras_are_refused():
+    log, table, _ = logged()
+    with pytest.raises(ConfigurationError, match=r"has 5 valid frames after the first 0\.25 s; wanted 50 or more"):
+        read_log(log.spec, table.iloc[:10])
+    with pytest.raises(ConfigurationError, match="with --sensing position or pixel, of a fixed camera; got stereo"):
+        identify(log, find_sensing("stereo").nominal(find_robot(ROBOT)))
+    with pytest.raises(ConfigurationError, match="feature_x_m"):
+        read_log(log.spec, table.drop(columns="feature_x_m"))
