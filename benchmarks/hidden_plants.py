@@ -95,16 +95,20 @@ def main() -> None:
     print(f"{len(runs)} logs, {(runs['said'] != '').sum()} with a line, median {runs['seconds'].median():.1f} s a log")
     print(runs.loc[runs["said"] != "", ["seed", "robot", "mismatch", "said"]].to_string())
     late = table[table["parameter"] == "latency"]
-    print(
-        f"latency within 5 ms: {(late['error'].abs() < 0.005).mean():.1%}, largest error {late['error'].abs().max():.4f} s"
-    )
+    error = late["error"].abs()
+    print(f"latency within 5 ms: {(error < 0.005).mean():.1%}, largest error {error.max():.4f} s")
     told = table[table["told"].fillna(False).astype(bool)]
     told = told.assign(covered=told["error"].abs() <= 1.96 * told["deviation"])
     own = told[~told["parameter"].isin(["command_delay", "lag"])]
     print(f"pooled coverage of 95 %: {own['covered'].mean():.1%} of {len(own)}")
     by = told.groupby("parameter")
-    print(pd.DataFrame({"logs": by.size(), "covered": by["covered"].mean(), "median deviation": by["deviation"].median(),
-                        "RMS error": by["error"].apply(lambda e: np.sqrt(np.mean(e**2)))}).to_string())  # fmt: skip
+    columns = {
+        "logs": by.size(),
+        "covered": by["covered"].mean(),
+        "median deviation": by["deviation"].median(),
+        "RMS error": by["error"].apply(lambda error: np.sqrt(np.mean(error**2))),
+    }
+    print(pd.DataFrame(columns).to_string())
 
 
 if __name__ == "__main__":

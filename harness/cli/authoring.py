@@ -167,7 +167,7 @@ def identify(
     sensing: options.SensingOption = "position",
     out: Annotated[Path | None, option("FILE", "TOML file of the twin, for --robot of all commands.")] = None,
 ) -> None:
-    """Identify a robot, its camera and its drive from a log, as a twin with intervals.
+    """Identify arm, camera and drive from a log, as a twin.
 
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """

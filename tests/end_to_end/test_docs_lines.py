@@ -35,6 +35,7 @@ ONLY_READ = {
     "figures": "needs the folder of a run, which test_pictures.py makes",
     "statistics": "needs the folder of a run; docs/five_minutes.md carries it out",
     "export": "needs the folder of a batch; tests/harness/test_exports.py exports one",
+    "identify": "needs a log; tests/harness/test_identification.py identifies some",
     "shadow": "needs a logged run; tests/harness/test_shadow.py shows some",
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
