@@ -169,16 +169,24 @@ class OwnCamera:
     def sensing(self, usual: SensingConfig, period: float) -> SensingConfig:
         """Return the settings of a sensor with this camera's timing and noise.
 
-        A frame takes a multiple of the control `period` [s], or else whole milliseconds.
+        A frame takes a multiple of the control `period` [s], or else whole milliseconds; where two or more are
+        delivered in each period, one arrives at every control instant.
 
         Raises:
             ValueError: a noise that cannot be read.
         """
         keys, changes = self.keys, dict[str, Any]()
         if keys.rate is not None:
-            count = round(1.0 / (keys.rate * period))
-            exact = abs(count * period * keys.rate - 1.0) < 1e-5
-            changes["frame_period"] = count * period if exact else max(1, round(1e3 / keys.rate)) / 1e3
+            frames, whole = keys.rate * period, max(1, round(1e3 / keys.rate)) / 1e3
+            count, more = round(1.0 / frames), round(frames)
+            if more > 1 and abs(frames / more - 1.0) < ROUNDED:
+                whole = 0.0
+            elif count and abs(count * frames - 1.0) < 1e-5:
+                whole = count * period
+            elif abs(round(whole / period) * period - whole) > ROUNDED * period:
+                clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
+                remark(f"camera {self.name}: {clocks}, so delays change; --set run.period={1e3 * whole:g}ms helps")
+            changes["frame_period"] = whole
         changes |= {} if keys.latency is None else {"latency": keys.latency}
         return override(str(self.files[0]), usual, changes | ({"feature_noise": keys.noise} if keys.noise else {}))
 
@@ -297,7 +305,7 @@ def turning_point(k1: float, k2: float, k3: float) -> float:
 
 def _check(camera: OwnCamera) -> None:
     """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
-    k1, k2, _, _, k3 = camera.distortion
+    k1, k2, p1, p2, k3 = camera.distortion
     s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
     far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
     if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
@@ -306,9 +314,11 @@ def _check(camera: OwnCamera) -> None:
             f"distortion {list(camera.distortion)} folds {image}, with this matrix; take them from one calibration"
         )
     squares = np.linspace(0.0, math.hypot(*far) ** 2)
-    if (moved := np.abs(squares * (k1 + squares * (k2 + squares * k3))).max()) > MAX_MOVED:
+    radial, tangential = squares * (k1 + squares * (k2 + squares * k3)), 3.0 * math.hypot(p1, p2) * np.sqrt(squares)
+    if (moved := (np.abs(radial) + tangential).max()) > MAX_MOVED:
         far_away = f"moves points by {moved:.0%} of their distance from the middle"
-        remark(f"distortion {list(camera.distortion)} {far_away}; coefficients of OpenCV are no percent")
+        order = f"coefficients of OpenCV are no percent, and in the order {', '.join(COEFFICIENTS)}"
+        remark(f"distortion {list(camera.distortion)} {far_away}; {order}")
     if camera.second is not None:
         pair = [(each.width, each.height, each.pose.frame) for each in (keys, camera.second.keys)]
         if pair[0] != pair[1]:

@@ -205,6 +205,11 @@ def test_a_bad_file_is_one_line(write, old, new, said):
         ),
         ("k1 = 0.12, k2 = -0.25", "k1 = 12.0, k2 = -25.0", "moves points by 144% of their distance from the middle"),
         (
+            "p1 = 0.002",
+            "p1 = 0.9",
+            "of their distance from the middle; coefficients of OpenCV are no percent, and in the",
+        ),
+        (
             "[0.0, 0.0, 0.70710678, 0.70710678]",
             "[1.0, 0.0, 0.0, 0.0]",
             "by more than 60° from the flange's z axis: z is",
@@ -221,6 +226,13 @@ def test_an_unlikely_file_is_remarked_on(write, caplog, old, new, said):
     assert old in CAMERA + ON_FLANGE
     read_camera(write((CAMERA + ON_FLANGE).replace(old, new)))
     assert said in caplog.text
+
+
+def test_a_ball_that_hardly_fits_into_the_image_is_remarked_on(write, caplog):
+    for radius in ("", "[target]\nradius = 0.08\n", "[target]\nradius = 0.4\n"):
+        remark.cache_clear()
+        Sensing.parse("pixel:hand").nominal(robot_with(write(CAMERA + ON_FLANGE + radius)))
+        assert ("px of an image 480 px high; is it its radius?" in caplog.text) == ("0.4" in radius)
 
 
 def test_a_camera_that_does_not_fit_the_set_up_is_refused_with_the_remedy(write):
@@ -262,3 +274,15 @@ def test_a_frame_takes_a_multiple_of_the_period_or_whole_milliseconds(write):
     sensing = camera.sensing(SensingConfig(), 0.05)
     assert (sensing.frame_period, sensing.latency, sensing.feature_noise) == (0.067, 0.08, 0.002)
     assert camera.sensing(SensingConfig(), 1.0 / 30.0).frame_period == pytest.approx(1.0 / 15.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rate", "period", "frame"), [(20, 0.05, 0.05), (60, 0.05, 0.0), (15, 0.067, 0.067), (5, 0.05, 0.2)]
+)
+def test_the_camera_and_the_controller_keep_time(write, caplog, rate, period, frame):
+    remark.cache_clear()
+    camera = read_camera(write(f"rate = {rate}\n{CAMERA}"))
+    assert camera.sensing(SensingConfig(), period).frame_period == pytest.approx(frame, abs=1e-12)
+    assert not caplog.text
+    camera.sensing(SensingConfig(), 0.047)
+    assert "so delays change; --set run.period=" in caplog.text
