@@ -50,7 +50,7 @@ from servobench.plant.robot.robot import Robot
 
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
 MAX_PLACE: Final = 20.0  # [m] of a usual target
-MIN_RATE: Final = 10.0  # [mm/rad] usual norm of a Jacobian
+RATES: Final = {"m": (0.01, 100.0), "mm": (10.0, 1e5)}  # unit -> usual norms of a Jacobian, in it per rad
 POINTS: Final = 12  # of a curve that are checked
 
 
@@ -312,8 +312,9 @@ def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
     own = sensing_file(run.request.sensing) is not None
     if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
         remark(f"--sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
-    if own and unit == "mm" and np.linalg.norm(J) < MIN_RATE:
-        remark(f"--sensing {run.request.sensing}: features move by {np.linalg.norm(J):.2g} mm/rad; are they in m?")
+    size, (least, most) = float(np.linalg.norm(J)), RATES.get(unit, (0.0, np.inf))
+    if own and not least <= size <= most:
+        remark(f"--sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?")
 
 
 def train_networks(

@@ -39,6 +39,7 @@ MIN_GAIN: Final = 0.8  # [1] share of the prediction error that another delay le
 MAX_EXCESS: Final = 0.1  # [rad] beyond its range that a joint may be in a log without a remark
 MAX_FEATURE: Final = 20.0  # [m] beyond which no feature is, in natural units
 MIN_MOTION: Final = 0.02  # [m] RMS distance from the mean, up to which noise may be larger than a motion
+MIN_SECOND: Final = 0.1  # share of the first direction of a motion that the second one needs to tell its sides apart
 MAX_LATE: Final = 12  # control periods by which features may be late
 MAX_SHARE_APART: Final = {"m": 0.2, "px": 0.35}  # share of the motion by which features may differ without a remark
 
@@ -63,8 +64,8 @@ class LoggedPlant(Plant):
         """
         self.spec, self._k = spec, 0
         names = column_names(spec)
-        given = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
-        self.joints, self._features = given
+        given = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature", "reference"))
+        self.joints, self._features, self.reference = given
         valid = numbers_of(LOG, table, ["feature_valid"]) if "feature_valid" in table else np.ones((len(table), 1))
         self._valid = valid[:, 0] != 0.0
         if not self._valid.any():
@@ -93,11 +94,12 @@ class LoggedPlant(Plant):
             raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
         if beyond.max() > MAX_EXCESS:
             remark(where)
-        sizes, unit = np.abs(self._features).max(axis=1), spec.feature.unit
-        far, size = int(sizes.argmax()), float(sizes.max())
-        if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
-            meant = "; if the log is in mm, write it in m" if unit == "m" else ""
-            raise ConfigurationError(f"row {far} of the log has a feature of {size:g} {unit}, beyond any camera{meant}")
+        for kind, values in (("feature", self._features), ("reference", self.reference)):
+            sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
+            far, size = int(sizes.argmax()), float(sizes.max())
+            if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
+                where = f"row {far} of the log has a {kind} of {size:g} {unit}, beyond any camera"
+                raise ConfigurationError(where + "; if the log is in mm, write it in m" * (unit == "m"))
         if model is not None and self._valid[MAX_LATE:].any():
             self._check_motion(model)
 
@@ -105,12 +107,15 @@ class LoggedPlant(Plant):
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
         y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self.joints)))
         rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
-        apart = min(_apart(y[-k:][self._valid[-k:]], p[:k][self._valid[-k:]], self.spec.feature.unit) for k in rows)
-        if apart > MAX_SHARE_APART.get(self.spec.feature.unit, MAX_SHARE_APART["px"]):
+        valid, unit = self._valid, self.spec.feature.unit
+        apart, mirrored = min(_apart(y[-k:][valid[-k:]], p[:k][valid[-k:]], unit) for k in rows)
+        if apart > MAX_SHARE_APART.get(unit, MAX_SHARE_APART["px"]):
             remark(
                 f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}: look for other "
                 "units, another order or sign of joints, another arm, or a camera that was moved"
             )
+        elif mirrored:
+            remark("features of the log are mirrored: x points right in the image, y down, z ahead")
 
     def reset(self, seed: int) -> Observation:
         """Go back to the first row; nothing is random. See `Plant.reset`."""
@@ -157,7 +162,7 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         log = StepLog(spec, len(table))
         loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
         desired = experiment.desired(loop.periods)
-        logged = numbers_of(LOG, table, column_names(spec)["reference"])
+        logged = plant.reference
         if not np.array_equal(desired[: len(logged)], logged):
             desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
         with careful():
@@ -228,17 +233,21 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def _apart(y: FloatArray, p: FloatArray, unit: str) -> float:
-    """Return the share of the motion of features (k, m) that no image of the others explains; 0 for short motions."""
+def _apart(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
+    """Return the share of the motion of features (k, m) that no image of the others explains, and if one is mirrored.
+
+    The share is 0 for short motions. A camera that looks from the other side shows a mirrored image.
+    """
     y, p = y - y.mean(axis=0), p - p.mean(axis=0)
     seen, made = _rms(y), _rms(p)
     if max(seen, made) < MIN_MOTION:
-        return 0.0
+        return 0.0, False
     image = nearest_rotation(y.T @ p).T if unit == "m" else np.linalg.lstsq(p, y, rcond=None)[0]
     if unit != "m" and 8.0 * seen < made:
-        return 1.0
-    rest = _rms(y - p @ image)
-    return rest / (max(seen, made) if unit == "m" else seen)
+        return 1.0, False
+    rest, sizes = _rms(y - p @ image), np.linalg.svd(y.T @ p, compute_uv=False)
+    sided = len(sizes) in (2, 3) and sizes[1] > MIN_SECOND * sizes[0]
+    return rest / (max(seen, made) if unit == "m" else seen), bool(sided and np.linalg.det(image[:2, :2]) < 0.0)
 
 
 def has_commands(steps: pd.DataFrame) -> bool:

@@ -28,6 +28,7 @@ from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.settings import remark
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera_file import OwnCamera, turning_point
 from servobench.plant.robot.hand_eye import rotation_matrix, turn_about
@@ -37,6 +38,7 @@ from servobench.plant.robot.workspace import camera_pose
 
 SIDE: Final = radians(60.0)  # angle of the second fixed camera's optical axis from the vertical
 HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
+MAX_SIZE: Final = 0.6  # usual share of the image's height that a ball takes
 BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
 OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has
 ON_HAND = "mount"  # the axis that a camera on the hand has
@@ -111,6 +113,11 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
             f"camera {robot.camera.name} does not see the target with the arm at home: the target is at "
             f"{where} m in the camera's frame (x right, y down, z ahead); wanted another pose, mount or target"
         )
+    if robot.camera is not None and (radius := robot.camera.keys.target.radius) is not None:
+        size, height = 2.0 * robot.pinhole.focal * radius / model.distance, robot.pinhole.height
+        if size > MAX_SIZE * height:
+            takes = f"takes {size:.0f} px of an image {height} px high"
+            remark(f"camera {robot.camera.name}: the ball {takes}; is it its radius?")
     return model
 
 

@@ -24,7 +24,8 @@ from servobench.plant.robot import ur5
 from servobench.plant.robot.robot import Robot
 
 RATED_PAYLOAD = 5.0  # [kg] of a UR5
-BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
+BoxNumbers = Annotated[tuple[Annotated[Number, Usual(20.0)], ...], Len(6, 6)]
+Load = Annotated[NonNegative, Usual(100.0)]
 
 
 class Box(NamedTuple):
@@ -53,9 +54,9 @@ class DriveConfig:
     """[Nm s/rad] at 1 rad/s as much as Coulomb friction; an order of magnitude, too."""
     friction_compensation: Share = 0.8
     """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
-    payload: NonNegative = 2.5
+    payload: Load = 2.5
     """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
-    assumed_payload: NonNegative = 0.9
+    assumed_payload: Load = 0.9
     """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
     def check(self, n: int) -> None:

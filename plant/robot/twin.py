@@ -30,6 +30,7 @@ from servobench.plant.contract.settings import (
     did_you_mean,
     nested,
     override,
+    remark,
     settings,
 )
 from servobench.plant.robot.arm import SerialArm
@@ -40,6 +41,7 @@ TIMES: Final = ("latency", "command_delay", "lag")
 CAMERA: Final = tuple(f"camera_{each}" for each in ("turn_x", "turn_y", "turn_z", "x", "y", "z"))
 TOOL: Final = ("tool_x", "tool_y", "tool_z")
 LENS: Final = ("focal", "centre_u", "centre_v", "distortion")
+MAX_DEVIATION: Final = 0.5  # [s, m, rad or 1] usual one of a parameter
 MIN_LENGTH: Final = 1e-6  # [m] of a translation that is a length
 Rows = tuple[tuple[Number, ...], ...]
 
@@ -181,6 +183,10 @@ def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:
         raise ValueError(f'{what}: camera.pose must have frame = "base", position and rotation')
     if any(len(row) != len(keys.parameters) for row in keys.factor):
         raise ValueError(f"{what}: each row of factor needs {len(keys.parameters)} numbers, one for each parameter")
+    sizes = [float(np.linalg.norm(column)) for column in zip(*keys.factor, strict=True)]
+    for name, value in (*keys.mean.items(), *zip(keys.parameters, sizes, strict=False)):
+        if abs(value) > MAX_DEVIATION and not name.startswith("centre_"):
+            remark(f"{what}: {name} deviates by {value:g}, and usually by {MAX_DEVIATION:g} at most, in s, m, rad or 1")
     size = len(keys.covariance)
     square = np.array(keys.covariance) if {len(row) for row in keys.covariance} == {size} else np.zeros((size, size))
     if size and not (np.allclose(square, square.T) and np.linalg.eigvalsh(square)[0] > 0.0):

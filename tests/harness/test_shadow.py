@@ -161,6 +161,8 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
     "arm": (JOINTS, lambda q: q[:, [2, 1, 0, 3, 4, 5]], "move otherwise than this robot's at these joints", False),
     "answers": ("feature_valid", lambda valid: np.full(valid.shape, "no"), "feature_valid must be a finite", True),
     "lost": ("feature_valid", np.zeros_like, "no row whose feature_valid is 1 or true", True),
+    "reference": ("reference_", lambda y: 1000.0 * y, "has a reference of .* m, beyond any camera; if the log", True),
+    "mirrored": (("feature_y", "reference_y"), np.negative, "features of the log are mirrored: x points right", False),
     "speeds": (COMMAND, np.degrees, "if they are in deg/s, write them in rad/s", False),
 }
 

@@ -278,6 +278,7 @@ SETUPS = (  # file, its second feature, the name of its third, unit
     ("still.py", "0.0 * z", "depth", "m"),
     ("double.py", "1.0 * z", "depth", "m"),
     ("mm.py", "np.arctan(y / (x + 1.0))", "depth", "mm"),
+    ("thousands.py", "1000.0 * y", "depth", "m"),
     ("named_twice.py", "y", "arc", "m"),
 )
 UNLIKELY = (  # task, its settings, sensing, message
@@ -287,7 +288,8 @@ UNLIKELY = (  # task, its settings, sensing, message
     ("target", {"target": [0.0, 0.5, 1.3]}, "position", "a target 160 mm from the arm's shoulder is within the arm"),
     ("exp2", {}, "./still.py", "--sensing ./still.py: a feature stands still, or moves as another one does"),
     ("exp2", {}, "./double.py", "--sensing ./double.py: a feature stands still, or moves as another one does"),
-    ("exp2", {}, "./mm.py", "mm/rad; are they in m?"),
+    ("exp2", {}, "./mm.py", "mm/rad; is mm their unit?"),
+    ("exp2", {}, "./thousands.py", "m/rad; is m their unit?"),
 )
 
 

@@ -14,9 +14,10 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.units import UNITS, in_own_unit, in_unit, split_quantity, units_of
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.mismatch import Mismatch
 
-DEFAULTS = {"kinematic": KinematicConfig(), "run": RunSettings()}
+DEFAULTS = {"bullet": RenderedConfig(), "kinematic": KinematicConfig(), "run": RunSettings()}
 
 
 def read(assignment):
@@ -86,12 +87,22 @@ def test_pixels_are_pixels_where_features_are():
 
 
 @pytest.mark.parametrize(
-    "assignment", ["kinematic.lag=5", "kinematic.sensing.latency=3", "kinematic.mechanics.backlash=2", "run.period=5"]
-)
+    "assignment",
+    ["kinematic.lag=5", "kinematic.sensing.latency=3", "kinematic.mechanics.backlash=2", "run.period=5",
+     "bullet.drives.payload=2500", "bullet.drives.assumed_payload=900"],
+)  # fmt: skip
 def test_times_and_angles_of_likely_other_units_are_remarked_on(assignment, caplog):
     remark.cache_clear()
     read(assignment)
     assert f"{assignment.replace('=', ' is ')}, and usually at most" in caplog.text
+
+
+def test_an_obstacle_in_millimetres_is_remarked_on(caplog):
+    remark.cache_clear()
+    read("bullet.obstacles=[[0.6,0,0.2,0.1,0.1,0.4]]")
+    assert not caplog.text
+    read("bullet.obstacles=[[600,0,200,100,100,400]]")
+    assert "bullet.obstacles is 600, and usually at most 20 m; if 600mm is meant" in caplog.text
 
 
 def test_a_plain_share_that_is_likely_one_of_percent_is_remarked_on(caplog):

@@ -10,6 +10,7 @@ from servobench.harness.run.experiment import build, draw_robot
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.twin import deviated
@@ -125,6 +126,22 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, old):
     with pytest.raises(ValueError, match=r"^[^\n]+$") as raised:
         find_robot(written(tmp_path, TWIN.replace(old, new)))
     assert message in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("zero_elbow = 0.05", "zero_elbow = 2.9", "zero_elbow deviates by 2.9, and usually by 0.5 at most"),
+        ("tool_x = 0.013", "tool_x = 13", "tool_x deviates by 13"),
+        ("[0.004,", "[4.0,", "latency deviates by 4"),
+    ],
+)
+def test_parameters_in_other_units_are_remarked_on(tmp_path, caplog, old, new, words):
+    remark.cache_clear()
+    find_robot(written(tmp_path, TWIN))
+    assert not caplog.text
+    find_robot(written(tmp_path, TWIN.replace(old, new)))
+    assert words in caplog.text
 
 
 def test_a_twin_of_a_twin_is_refused(twin, tmp_path):
