@@ -107,7 +107,8 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty
     if lacking:
         raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
-    values = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    with configuration_errors(f"{what} has a number without end: ", OverflowError):
+        values = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0].tolist()
         cell = str(table[names[column]].iloc[row])

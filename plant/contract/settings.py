@@ -387,7 +387,8 @@ def describe(error: ValidationError, name: str = "", written: object = None, uni
     """
     first = error.errors(include_url=False)[0]
     for place in first["loc"]:
-        written = written[place] if isinstance(written, tuple) and isinstance(place, int) else written
+        if isinstance(written, tuple) and isinstance(place, int) and place < len(written):
+            written = written[place]
     name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])
     kind, context, came = first["type"], first.get("ctx", {}), first["input"]
     if kind == "value_error":

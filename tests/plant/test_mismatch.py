@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from kit.plants import factory_ur5, nominal_ur5
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.mismatch import MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
+from servobench.plant.robot.mismatch import AXES, MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
 from servobench.plant.robot.workspace import CENTRE
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
@@ -131,6 +131,14 @@ def test_a_negative_magnitude_is_refused():
 )
 def test_a_range_of_magnitudes_includes_both_ends(axis, text, magnitudes):
     assert tuple(str(each) for each in parse_magnitudes(axis, text)) == magnitudes
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_a_range_of_every_axis_has_an_example_that_can_be_used(axis):
+    with pytest.raises(ValueError, match=f"such as {axis}=") as refusal:
+        parse_magnitudes(axis, "")
+    example = str(refusal.value).partition(f"such as {axis}=")[2].partition(";")[0]
+    assert len(parse_magnitudes(axis, example)) > 1
 
 
 @pytest.mark.parametrize("seed", range(20))
