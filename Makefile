@@ -43,6 +43,8 @@ nightly: $(VENV)/ready
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 	$(NIGHT).hostile_sweep --runs 10000
+	$(NIGHT).signed_folders --folders 10000
+	$(NIGHT).kills --kills 100
 	$(NIGHT).mutation
 
 # Make the golden runs anew (tests/closed_loop/golden_runs.csv), and how far rounding moves them; prints a line for CHANGELOG.md.

@@ -68,13 +68,14 @@ class Night:
         """Kill a sweep when a share of its runs is there; return how long something of it lived on [s]."""
         self.wait(process, lambda: self.count("hard") >= share * self.runs)
         process.kill()
-        process.communicate()
         killed = time.monotonic()
-        while self.left():
+        while process.poll() is None or self.left():
             if time.monotonic() - killed > SOON:
                 sys.exit(f"{SOON:g} s after the sweep was killed, these live on: {self.left()}")
             time.sleep(0.02)
-        return time.monotonic() - killed
+        lived = time.monotonic() - killed
+        process.communicate()
+        return lived
 
     def wait(self, process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
         """Wait until a condition holds while a sweep runs."""

@@ -297,6 +297,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
+    beside = processes.descendants(os.getppid())  # the tracker of resources among them
     gc.freeze()  # so that runners go on sharing the memory of all imports
     guard = _Guard(link, limits)
     try:
@@ -306,6 +307,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
         pass
     finally:
         guard.end_runner()
+        processes.send(beside, signal.SIGCONT)  # a stopped tracker does not notice that it is to end
 
 
 class _Guard:

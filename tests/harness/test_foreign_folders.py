@@ -6,8 +6,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import pytest
 
 from kit.command import servobench
 from kit.folders import MANIFEST, comparison, made_up_row, made_up_steps, write_folder
+from kit.writes import noting
 from servobench.harness.batch import results, tables
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract import files
@@ -28,44 +28,6 @@ from servobench.plant.contract.checksums import SUMS, write_vouched
 RUN = "kinematic-constant-exp1-moderate-0"
 TEXTS = ("plant", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit", "outcome", "reason")
 PAYLOADS = ("../../escaped", "/ELSEWHERE/escaped", "=cmd|'/C calc'!A1", "$(touch escaped)", "<b>", "x\n## y", "%s{0}")
-WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
-TARGETS = {"os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}  # arguments that are written, by event
-TARGETS |= dict.fromkeys(("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod", "shutil.rmtree"), (0,))
-RELATIVE = ("os.mkdir", "os.remove", "os.rmdir", "os.rename")
-OWN_PROGRAMS = ("git", "fc-list", "uname")  # which servobench, matplotlib and the platform module start
-PROGRAMS = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen")
-_notes: list[list[tuple[str, str]]] = []  # the list of the moment: a hook cannot be taken away
-
-
-def _note(event: str, arguments: tuple[object, ...]) -> None:
-    if not _notes:
-        return
-    if event == "open":
-        path, mode, flags = arguments
-        if isinstance(path, str | bytes) and (set(str(mode)) & set("wax+") or int(flags) & WRITING):
-            _notes[-1].append((event, os.path.realpath(os.fsdecode(path))))
-    elif event in TARGETS:
-        at = arguments[-1] if event in RELATIVE else -1  # a descriptor of the folder from which paths count
-        base = Path(f"/proc/self/fd/{at}" if isinstance(at, int) and at >= 0 else "")
-        for given in (arguments[index] for index in TARGETS[event]):
-            if not isinstance(given, int):  # an open file was noted when it was opened
-                path = base / os.fsdecode(given)
-                _notes[-1].append((event, str(path.parent.resolve() / path.name)))
-    elif event in PROGRAMS and Path(str(arguments[0])).name not in OWN_PROGRAMS:
-        _notes[-1].append((event, str(arguments[0])))
-
-
-sys.addaudithook(_note)
-
-
-@contextmanager
-def noting() -> Iterator[list[tuple[str, str]]]:
-    """Yield what is opened for writing, renamed, removed or started within the context."""
-    _notes.append([])
-    try:
-        yield _notes[-1]
-    finally:
-        _notes.pop()
 
 
 def row(**values: object) -> dict[str, object]:

@@ -116,9 +116,9 @@ if __name__ == "__main__":
     while starts and not os.path.exists("begun"):
         time.sleep(0.05)
     print(*below, flush=True)
-    for guard in below:
-        if processes.descendants(guard):
-            os.kill(guard, signal.SIGSTOP)
+    for each in below:
+        if not starts:
+            os.kill(each, signal.SIGSTOP)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
@@ -126,7 +126,7 @@ SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("starts", [False, True])
-def test_a_guard_that_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
+def test_what_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
     (tmp_path / "killed.py").write_text(KILLED.format(starts=starts))
     (tmp_path / "imported.py").write_text(SLOW)
     path = {**os.environ, "PYTHONPATH": str(PACKAGE)}

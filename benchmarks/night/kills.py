@@ -1,0 +1,157 @@
+"""Signals at random instants to the processes of a sweep, which goes on with --resume; its tables stay bit-equal.
+
+    PYTHONPATH=tests:benchmarks python -m night.kills --kills 100
+
+A victim is the command, a process right below it (a guard or the tracker of resources) or one below these (a runner).
+The command goes on after a signal to the others; where it ends, or is stopped and then killed, everything that it
+started must be gone 5 s later. A table has six signals on its way; each second batch is of this package's code only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from kit.command import judged, left_behind
+from night import hostile_controllers
+from servobench.harness.batch.processes import descendants
+
+SIGNALS: Final = ("KILL", "TERM", "INT", "HUP", "QUIT", "STOP")
+MARK: Final = "SERVOBENCH_KILLS"  # an environment variable that everything started here inherits
+SOON: Final = 5.0  # [s] until nothing is left of a command that has ended
+LONG: Final = 15.0  # [s] until what is left then is ended here
+PATIENCE: Final = 600.0  # [s] for a call to end by itself
+LATEST: Final = 9.0  # [s] of a call until its first signal at the latest, and between two signals
+BATCHES: Final = (f"{hostile_controllers.__file__}:Quiet,constant", "constant,calibrated")
+
+
+@dataclass
+class Outcome:
+    """What came of the signals."""
+
+    signals: Counter[tuple[str, str]] = field(default_factory=Counter)  # by victim and signal
+    lived: dict[tuple[str, str], float] = field(default_factory=dict)  # [s] after the end of the command, the longest
+    tables: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+class Sweep:
+    """A sweep that is signalled and goes on."""
+
+    def __init__(self, folder: Path, controllers: str, runs: int) -> None:
+        self.folder = folder
+        self._call = ["sweep", "--controllers", controllers, "--seeds", f"0:{runs // 2}", "--workers", "2", "--out"]
+        self._known = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), MARK: str(folder), "PEACE": "1"}
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start it, or go on."""
+        further = [str(self.folder), *["--resume"] * self.folder.exists()]
+        call = [sys.executable, "-m", "servobench", *self._call, *further]
+        with self.folder.with_suffix(".txt").open("wb") as said:
+            return subprocess.Popen(call, env=self._known, stdout=subprocess.DEVNULL, stderr=said)
+
+    def complain(self, code: int) -> str:
+        """Return the fault of a call that has ended: a trace, or an end that it should not have."""
+        said = self.folder.with_suffix(".txt").read_text(errors="replace")
+        return said[-1500:] if "Traceback" in said or code not in (0, 1, 130, -1, -3, -9, -15) else ""
+
+
+def signalled(sweep: Sweep, process: subprocess.Popen[bytes], source: random.Random, found: Outcome) -> bool:
+    """Send a signal at a random instant; return whether there was one before the sweep was over."""
+    time.sleep(source.uniform(0.05, LATEST))
+    if process.poll() is not None:
+        return False
+    children = descendants(process.pid)
+    near = [each for each in children if _parent(each) == process.pid]
+    victims = {"command": [process.pid], "below it": near, "runner": [each for each in children if each not in near]}
+    kind = source.choice([name for name, each in victims.items() if each])
+    name = source.choice(SIGNALS)
+    os.kill(source.choice(victims[kind]), getattr(signal, f"SIG{name}"))
+    found.signals[kind, name] += 1
+    if kind == "command":
+        if name == "STOP":
+            time.sleep(source.uniform(0.0, 3.0))
+            process.kill()
+        end(sweep, process, (kind, name), found)
+    return True
+
+
+def _parent(process: int) -> int:
+    try:
+        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
+
+
+def end(sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], found: Outcome) -> int | None:
+    """Wait for a call to end, and for everything that it started; note the faults."""
+    try:
+        code = process.wait(PATIENCE)
+    except subprocess.TimeoutExpired:
+        found.faults.append(f"{last}: the command still runs after {PATIENCE:g} s")
+        process.kill()
+        code = process.wait()
+    ended = time.monotonic()
+    while (left := left_behind(MARK, str(sweep.folder))) and time.monotonic() - ended < LONG:
+        time.sleep(0.02)
+    lived = time.monotonic() - ended
+    found.lived[last] = max(found.lived.get(last, 0.0), lived)
+    if lived > SOON:
+        found.faults.append(f"{last}: {lived:.1f} s after the end there was {left}")
+    if complaint := sweep.complain(code):
+        found.faults.append(f"{last}: exit code {code}: {complaint}")
+    return code
+
+
+def table(folder: Path) -> pd.DataFrame:
+    """Return the table of a sweep without the times of the clock."""
+    return judged(pd.read_parquet(folder / "runs.parquet"))
+
+
+def main() -> None:
+    """Carry everything out and print a table; exit code 1 if something was amiss."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--runs", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=101)
+    given = parser.parse_args()
+    source, found = random.Random(given.seed), Outcome()
+    with tempfile.TemporaryDirectory(prefix="servobench-kills-") as scratch:
+        quiet = [Sweep(Path(scratch, f"quiet{k}"), names, given.runs) for k, names in enumerate(BATCHES)]
+        for each in quiet:
+            assert end(each, each.start(), ("none", ""), found) == 0, found.faults
+        while found.signals.total() < given.kills:
+            batch, goal = found.tables % 2, min(given.kills, found.signals.total() + len(SIGNALS))
+            sweep = Sweep(Path(scratch, f"table{found.tables}"), BATCHES[batch], given.runs)
+            process = sweep.start()
+            while found.signals.total() < goal and signalled(sweep, process, source, found):
+                process = process if process.poll() is None else sweep.start()
+            if end(sweep, process, ("last", ""), found) != 0:
+                end(sweep, sweep.start(), ("last", ""), found)
+            found.tables += 1
+            try:
+                pd.testing.assert_frame_equal(table(sweep.folder), table(quiet[batch].folder), check_exact=True)
+            except (AssertionError, OSError) as error:
+                found.faults.append(f"table {found.tables}: {error}")
+    for key, count in sorted(found.signals.items()):
+        print(f"{key[0]:10} {key[1]:5} {count:3}, lived {found.lived.get(key, 0.0):.2f} s after the end")
+    print(
+        f"{found.signals.total()} signals, {found.tables} tables, {len(found.faults)} faults", *found.faults, sep="\n"
+    )
+    sys.exit(bool(found.faults))
+
+
+if __name__ == "__main__":
+    main()
