@@ -26,19 +26,12 @@ Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 
 @dataclass(frozen=True)
 class Delays:
-    """Delays of commands and features.
+    """Delays of commands and features."""
 
-    Attributes:
-        latency: s, of the camera.
-        command_delay: s, from a command to its first effect.
-        lag: s, time constant of the joints' velocity loops.
-        latency_spread: s, by which a frame may be later than the latency.
-    """
-
-    latency: float
-    command_delay: float
-    lag: float
-    latency_spread: float = 0.0
+    latency: float  # s, of the camera
+    command_delay: float  # s, from a command to its first effect
+    lag: float  # s, time constant of the joints' velocity loops
+    latency_spread: float = 0.0  # s, by which a frame may be later than the latency
 
 
 @dataclass(frozen=True)

@@ -43,15 +43,10 @@ class InitialConfig:
 
 
 class InitialJacobian(ABC, Generic[State]):
-    """Provides Ĵ₀, at once or after probing moves; pure, with leading axes, as estimators are.
+    """Provides Ĵ₀, at once or after probing moves; pure, with leading axes, as estimators are."""
 
-    Attributes:
-        immediate: whether Ĵ₀ is known from the start, so that `step` is never called.
-        duration: [periods] until it is known, where no frame is lost.
-    """
-
-    immediate: ClassVar[bool]
-    duration: int = 0
+    immediate: ClassVar[bool]  # whether Ĵ₀ is known from the start, so that `step` is never called
+    duration: int = 0  # [periods] until it is known, where no frame is lost
 
     @abstractmethod
     def start(self, observation: Observation) -> State:

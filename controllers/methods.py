@@ -106,30 +106,19 @@ def _find(kind: str, name: str, parts: Mapping[str, Part[Kind]]) -> Part[Kind]:
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Settings of a composed controller.
+    """Settings of a composed controller."""
 
-    Attributes:
-        estimator: settings of its estimator.
-        law: settings of its control law.
-        initial: where the first Jacobian comes from.
-        aids: the stages around them.
-    """
-
-    estimator: Any
-    law: Any
-    initial: InitialConfig
-    aids: AidsConfig
+    estimator: Any  # settings of its estimator
+    law: Any  # settings of its control law
+    initial: InitialConfig  # where the first Jacobian comes from
+    aids: AidsConfig  # the stages around them
 
 
 @dataclass(frozen=True)
 class TrainedMethodConfig(MethodConfig):
-    """Settings of a composed controller of which a part starts from networks that are trained offline.
+    """Settings of a composed controller of which a part starts from networks that are trained offline."""
 
-    Attributes:
-        training: the offline fits; methods with equal settings share the networks.
-    """
-
-    training: TrainingConfig
+    training: TrainingConfig  # the offline fits; methods with equal settings share the networks
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,10 @@ from servobench.plant.contract.checks import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class NaturalJacobian:
-    """A Jacobian in natural units; its lanes are those of the function, where that has some.
+    """A Jacobian in natural units; its lanes are those of the function, where that has some."""
 
-    Attributes:
-        function: (..., n) rad -> (..., m, n), in the unit of the feature.
-        scale: s, in that unit.
-    """
-
-    function: JacobianFunction
-    scale: float
+    function: JacobianFunction  # (..., n) rad -> (..., m, n), in the unit of the feature.
+    scale: float  # s, in that unit
 
     def __call__(self, joint_position: FloatArray) -> FloatArray:
         """Return J / s, (..., m, n)."""

@@ -84,15 +84,10 @@ def shape_of(variable: Any) -> tuple[int, ...]:  # noqa: ANN401 - fmpy's classes
 
 @dataclass(frozen=True)
 class Validation:
-    """Result of the checks.
+    """Result of the checks."""
 
-    Attributes:
-        problems: one line for each; empty if there are none.
-        deviation: largest difference from the reference run, or None without a reference run.
-    """
-
-    problems: tuple[str, ...]
-    deviation: float | None
+    problems: tuple[str, ...]  # one line for each; empty if there are none
+    deviation: float | None  # largest difference from the reference run, or None without a reference run
 
 
 def validate_fmu(path: Path) -> Validation:

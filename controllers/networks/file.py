@@ -26,21 +26,13 @@ ARRAYS = ("centres", "widths", "weights")  # names of the arrays of either netwo
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetworks:
-    """Both networks as the offline training left them.
+    """Both networks as the offline training left them."""
 
-    Attributes:
-        jacobian: the Jacobian network.
-        controller: the controller network.
-        jacobian_error: held-out RMS of ‖Ĵ − J‖ over that of ‖J‖.
-        controller_error: held-out RMS over joints of ψ ξ − q_cmd, rad.
-        digest: hash of the configuration and of the model.
-    """
-
-    jacobian: JacobianNetwork
-    controller: ControllerNetwork
-    jacobian_error: float
-    controller_error: float
-    digest: str
+    jacobian: JacobianNetwork  # the Jacobian network
+    controller: ControllerNetwork  # the controller network
+    jacobian_error: float  # held-out RMS of ‖Ĵ − J‖ over that of ‖J‖
+    controller_error: float  # held-out RMS over joints of ψ ξ − q_cmd, rad
+    digest: str  # hash of the configuration and of the model
 
     def __post_init__(self) -> None:
         """Check that both networks are of the same robot."""

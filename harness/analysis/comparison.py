@@ -80,19 +80,12 @@ NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
 
 @dataclass(frozen=True)
 class Difference:
-    """How a first method differs from a second one on the same robots, in a measure of which less is better.
+    """How a first method differs from a second one on the same robots, in a measure of which less is better."""
 
-    Attributes:
-        mean: of first − second over the robots on which neither is lost, with Student's interval of 90 %.
-        probability: P(first < second) + P(equal)/2 on a robot, where a lost run is worse than any other.
-        lost: number of lost runs of the first and of the second.
-        verdict: on the first.
-    """
-
-    mean: Estimate
-    probability: Estimate
-    lost: tuple[int, int]
-    verdict: Verdict
+    mean: Estimate  # of first − second over the robots on which neither is lost, with Student's interval of 90 %
+    probability: Estimate  # P(first < second) + P(equal)/2 on a robot, where a lost run is worse than any other
+    lost: tuple[int, int]  # number of lost runs of the first and of the second
+    verdict: Verdict  # on the first
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Difference:

@@ -44,17 +44,11 @@ Checks: TypeAlias = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Tried:
-    """A controller or plant with the result of its trial.
+    """A controller or plant with the result of its trial."""
 
-    Attributes:
-        name: by which it is found.
-        summary: a line on it; empty where it cannot be used.
-        fault: why it cannot be used, in one line; empty where it can.
-    """
-
-    name: str
-    summary: str = ""
-    fault: str = ""
+    name: str  # by which it is found
+    summary: str = ""  # a line on it; empty where it cannot be used
+    fault: str = ""  # why it cannot be used, in one line; empty where it can
 
 
 class _Trains(BaseException):

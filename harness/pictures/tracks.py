@@ -209,23 +209,14 @@ def label_of(feature: str) -> str:
 @final
 @dataclass(frozen=True, eq=False)
 class Ensemble(Shown):
-    """The runs of one controller on one task, a row a seed.
+    """The runs of one controller on one task, a row a seed."""
 
-    Attributes:
-        runs: their rows in the table of runs.
-        time: instants, (k,) [s].
-        error: norm of the true error, (r, k) [`error_unit`]; infinite from an early end on.
-        jacobian_error: relative, (r, k) [%]; NaN where it is not known.
-        step_time: of all steps of the controller, (s,) [µs].
-        camera_moved_at: when the camera was moved [s]; NaN where it was not.
-    """
-
-    runs: pd.DataFrame
-    time: FloatArray
-    error: FloatArray
-    jacobian_error: FloatArray
-    step_time: FloatArray
-    camera_moved_at: float
+    runs: pd.DataFrame  # their rows in the table of runs
+    time: FloatArray  # instants, (k,) [s]
+    error: FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
+    jacobian_error: FloatArray  # relative, (r, k) [%]; NaN where it is not known
+    step_time: FloatArray  # of all steps of the controller, (s,) [µs]
+    camera_moved_at: float  # when the camera was moved [s]; NaN where it was not
 
     @property
     def period(self) -> float:

@@ -81,35 +81,20 @@ def frames_of(log: Log) -> Any:  # noqa: ANN401 - of indices
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A robot identified from a log.
+    """A robot identified from a log."""
 
-    Attributes:
-        names: of the parameters.
-        values: θ, (p,), for the camera the difference from its nominal pose.
-        covariance: of the posterior, (p, p).
-        told: which parameters the log tells, (p,).
-        factor: (d, p), whose rows are the directions that the log tells; factorᵀ factor is their covariance.
-        untold: (e, p), directions of θ that it does not tell, of length 1 in units of the priors.
-        pose: of the camera at θ, (4, 4).
-        noise: Σ, (m, m).
-        residuals: of all valid frames, (k, m).
-        rows: of these frames in the log, (k,).
-        inliers: which of them are no outliers, (k,).
-        correlation: f [frames].
-    """
-
-    names: tuple[str, ...]
-    values: FloatArray
-    covariance: FloatArray
-    told: BoolArray
-    factor: FloatArray
-    untold: FloatArray
-    pose: FloatArray
-    noise: FloatArray
-    residuals: FloatArray
-    rows: Any
-    inliers: BoolArray
-    correlation: float
+    names: tuple[str, ...]  # of the parameters
+    values: FloatArray  # θ, (p,), for the camera the difference from its nominal pose
+    covariance: FloatArray  # of the posterior, (p, p)
+    told: BoolArray  # which parameters the log tells, (p,)
+    factor: FloatArray  # (d, p), whose rows are the directions that the log tells; factorᵀ factor is their covariance
+    untold: FloatArray  # (e, p), directions of θ that it does not tell, of length 1 in units of the priors
+    pose: FloatArray  # of the camera at θ, (4, 4)
+    noise: FloatArray  # Σ, (m, m)
+    residuals: FloatArray  # of all valid frames, (k, m)
+    rows: Any  # of these frames in the log, (k,)
+    inliers: BoolArray  # which of them are no outliers, (k,)
+    correlation: float  # f [frames]
 
     @property
     def deviations(self) -> FloatArray:

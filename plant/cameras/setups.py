@@ -185,29 +185,17 @@ MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate 
 @final
 @dataclass(frozen=True, eq=False)
 class SetupModel(RobotModel):
-    """An arm and its cameras under a sensing set-up; arrays have the leading axes of the arm's.
+    """An arm and its cameras under a sensing set-up; arrays have the leading axes of the arm's."""
 
-    Attributes:
-        arm: the arm.
-        setup: the set-up.
-        mount: of the cameras.
-        cameras: (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
-        optics: their intrinsics.
-        target: (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
-        distance: from the cameras to the target in the middle of the workspace, as planned [m].
-        planned: image of a camera as planned, whose focal length decides the natural size of a feature.
-        far: distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m].
-    """
-
-    arm: SerialArm
-    setup: SensingSetup
-    mount: Mount
-    cameras: FloatArray
-    optics: Optics
-    target: FloatArray
-    distance: float
-    planned: PinholeCamera
-    far: float
+    arm: SerialArm  # the arm
+    setup: SensingSetup  # the set-up
+    mount: Mount  # of the cameras
+    cameras: FloatArray  # (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
+    optics: Optics  # their intrinsics
+    target: FloatArray  # (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
+    distance: float  # from the cameras to the target in the middle of the workspace, as planned [m]
+    planned: PinholeCamera  # image of a camera as planned, whose focal length decides the natural size of a feature
+    far: float  # distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m]
 
     @cached_property
     def channel(self) -> Channel:

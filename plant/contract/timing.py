@@ -18,21 +18,13 @@ TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of the bench in sub-steps of length h; sub-step i ends at the time i h.
+    """Times of the bench in sub-steps of length h; sub-step i ends at the time i h."""
 
-    Attributes:
-        steps: in a control period, N.
-        delays: [periods] age of the command that acts in each of the N sub-steps of a period.
-        latency: between exposure and delivery of a frame.
-        frames: between two exposures.
-        phase: of the exposures, which happen after each sub-step i with i mod `frames` = `phase`.
-    """
-
-    steps: int
-    delays: tuple[int, ...]
-    latency: int
-    frames: int
-    phase: int
+    steps: int  # in a control period, N
+    delays: tuple[int, ...]  # [periods] age of the command that acts in each of the N sub-steps of a period
+    latency: int  # between exposure and delivery of a frame
+    frames: int  # between two exposures
+    phase: int  # of the exposures, which happen after each sub-step i with i mod `frames` = `phase`
 
     @classmethod
     def of(cls, period: float, step: float, command_delay: float, sensing: SensingConfig) -> Self:

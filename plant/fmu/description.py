@@ -53,41 +53,23 @@ class Variable:
 
 @dataclass(frozen=True)
 class FmuDescription:
-    """The part of a model description that is used here.
+    """The part of a model description that is used here."""
 
-    Attributes:
-        path: the .fmu file, for messages.
-        version: 2 or 3.
-        model_name: for people.
-        identifier: file name of the library.
-        token: GUID or instantiation token.
-        can_save: states can be saved and restored.
-        can_serialise: saved states can be turned into bytes.
-        once_per_process: its library bears one instance only.
-        variables: all of them, in order.
-        needs_tool: it calls the tool that made it, which has to be installed.
-        exchange: it offers model exchange only and has to be integrated by a solver.
-        n_states: number of continuous states.
-        n_indicators: number of event indicators.
-        internal_step: its own fixed step size, s, of which steps must be multiples; None for none.
-        usual_step: that of its default experiment, s; None for none.
-    """
-
-    path: Path
-    version: int
-    model_name: str
-    identifier: str
-    token: str
-    can_save: bool
-    can_serialise: bool
-    once_per_process: bool
-    variables: tuple[Variable, ...]
-    needs_tool: bool = False
-    exchange: bool = False
-    n_states: int = 0
-    n_indicators: int = 0
-    internal_step: float | None = None
-    usual_step: float | None = None
+    path: Path  # the .fmu file, for messages.
+    version: int  # 2 or 3
+    model_name: str  # for people
+    identifier: str  # file name of the library
+    token: str  # GUID or instantiation token
+    can_save: bool  # states can be saved and restored
+    can_serialise: bool  # saved states can be turned into bytes
+    once_per_process: bool  # its library bears one instance only
+    variables: tuple[Variable, ...]  # all of them, in order
+    needs_tool: bool = False  # it calls the tool that made it, which has to be installed
+    exchange: bool = False  # it offers model exchange only and has to be integrated by a solver
+    n_states: int = 0  # number of continuous states
+    n_indicators: int = 0  # number of event indicators
+    internal_step: float | None = None  # its own fixed step size, s, of which steps must be multiples; None for none
+    usual_step: float | None = None  # that of its default experiment, s; None for none
 
     @cached_property
     def _by_name(self) -> dict[str, Variable]:

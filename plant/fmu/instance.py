@@ -78,25 +78,15 @@ class Port:
 
 
 class Instance(ABC):
-    """One instance of an FMU.
+    """One instance of an FMU."""
 
-    Attributes:
-        prefix: of the names of all functions in the library.
-        real: word for real numbers in the names of the functions that read and write them.
-        kinds: the same word for each numeric type, and how its numbers lie in memory.
-        state: word for states in the names of their functions.
-        deserialise: the verb of the function that reads a state from bytes.
-        early: word for a step that ended early.
-        derivatives: name of the function that reads the states' derivatives.
-    """
-
-    prefix: ClassVar[str]
-    real: ClassVar[str]
-    kinds: ClassVar[Kinds]
-    state: ClassVar[str]
-    deserialise: ClassVar[str]
-    early: ClassVar[str]
-    derivatives: ClassVar[str]
+    prefix: ClassVar[str]  # of the names of all functions in the library
+    real: ClassVar[str]  # word for real numbers in the names of the functions that read and write them
+    kinds: ClassVar[Kinds]  # the same word for each numeric type, and how its numbers lie in memory
+    state: ClassVar[str]  # word for states in the names of their functions
+    deserialise: ClassVar[str]  # the verb of the function that reads a state from bytes
+    early: ClassVar[str]  # word for a step that ended early
+    derivatives: ClassVar[str]  # name of the function that reads the states' derivatives
 
     def __init__(
         self,

@@ -52,22 +52,14 @@ class SerialArm:
     """A serial arm with n revolute joints and a ball on its flange.
 
     All arrays have the same leading axes.
-
-    Attributes:
-        joint_names: n names.
-        translation: (..., n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
-        rpy: (..., n+1, 3), rad; the rotations that belong to them.
-        joint_offset: (..., n), rad.
-        gear_ratio: (..., n), true joint motion over reported joint motion.
-        tool: (..., 3), m, ball centre in the flange frame.
     """
 
-    joint_names: tuple[str, ...]
-    translation: FloatArray
-    rpy: FloatArray
-    joint_offset: FloatArray
-    gear_ratio: FloatArray
-    tool: FloatArray
+    joint_names: tuple[str, ...]  # n names
+    translation: FloatArray  # (..., n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
+    rpy: FloatArray  # (..., n+1, 3), rad; the rotations that belong to them.
+    joint_offset: FloatArray  # (..., n), rad.
+    gear_ratio: FloatArray  # (..., n), true joint motion over reported joint motion.
+    tool: FloatArray  # (..., 3), m, ball centre in the flange frame.
 
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
@@ -202,17 +194,11 @@ def arm_from_modified_dh(
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """The limits of n joints.
+    """The limits of n joints."""
 
-    Attributes:
-        lower: (n,) [rad].
-        upper: (n,) [rad].
-        speed: (n,) [rad/s], the same both ways.
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    speed: FloatArray
+    lower: FloatArray  # (n,) [rad]
+    upper: FloatArray  # (n,) [rad]
+    speed: FloatArray  # (n,) [rad/s], the same both ways
 
     def __post_init__(self) -> None:
         """Check order and signs and freeze the arrays."""

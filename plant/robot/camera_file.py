@@ -139,21 +139,13 @@ class CameraFile:
 
 @dataclass(frozen=True, eq=False)
 class OwnCamera:
-    """A user's camera.
+    """A user's camera."""
 
-    Attributes:
-        files: from which it was read, its own first.
-        keys: of the file.
-        matrix: (3, 3) [px], of intrinsics.
-        distortion: k1, k2, p1, p2, k3 [1].
-        second: of a stereo pair; None for a single camera.
-    """
-
-    files: tuple[Path, ...]
-    keys: CameraFile
-    matrix: FloatArray
-    distortion: tuple[float, ...]
-    second: OwnCamera | None
+    files: tuple[Path, ...]  # from which it was read, its own first
+    keys: CameraFile  # of the file
+    matrix: FloatArray  # (3, 3) [px], of intrinsics
+    distortion: tuple[float, ...]  # k1, k2, p1, p2, k3 [1]
+    second: OwnCamera | None  # of a stereo pair; None for a single camera
 
     @property
     def name(self) -> str:

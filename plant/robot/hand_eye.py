@@ -211,13 +211,9 @@ class HandEyeModel(RobotModel):
 
 @dataclass(frozen=True, eq=False)
 class TrueJacobian:
-    """The Jacobian of a model as a function, of which `servobench.plant.contract.lanes.take` can choose lanes.
+    """The Jacobian of a model as a function, of which `servobench.plant.contract.lanes.take` can choose lanes."""
 
-    Attributes:
-        model: arm and camera.
-    """
-
-    model: RobotModel
+    model: RobotModel  # arm and camera
 
     def __call__(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""

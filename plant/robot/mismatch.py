@@ -217,27 +217,16 @@ def _range(name: str, text: str, begin: float, end: float, step: float) -> list[
 
 @dataclass(frozen=True)
 class MismatchSample:
-    """The values drawn for one run; all of them go into the log.
+    """The values drawn for one run; all of them go into the log."""
 
-    Attributes:
-        link_scale: (n+1, 3), factors on the translations between joints.
-        joint_offset: (n,), rad, added to the nominal offsets.
-        gear_ratio: (n,), factors on the nominal gear ratios.
-        tool_offset: (3,), m, in the flange frame.
-        camera_axis: (3,), unit vector in the camera frame.
-        camera_angle: rad.
-        move_axis: (3,), unit vector in the camera frame, of the move in the middle of the run.
-        move_angle: rad.
-    """
-
-    link_scale: FloatArray
-    joint_offset: FloatArray
-    gear_ratio: FloatArray
-    tool_offset: FloatArray
-    camera_axis: FloatArray
-    camera_angle: float
-    move_axis: FloatArray
-    move_angle: float
+    link_scale: FloatArray  # (n+1, 3), factors on the translations between joints
+    joint_offset: FloatArray  # (n,), rad, added to the nominal offsets
+    gear_ratio: FloatArray  # (n,), factors on the nominal gear ratios
+    tool_offset: FloatArray  # (3,), m, in the flange frame
+    camera_axis: FloatArray  # (3,), unit vector in the camera frame
+    camera_angle: float  # rad
+    move_axis: FloatArray  # (3,), unit vector in the camera frame, of the move in the middle of the run
+    move_angle: float  # rad
 
     def moved(self, model: RobotModel, robot: Robot) -> RobotModel | None:
         """Return the true `robot`, `model`, after its camera was moved in the middle of the run; None if it is not."""

@@ -30,24 +30,15 @@ class Links:
     """The moving links as rigid bodies and as shapes; row i is the link after joint i+1.
 
     Masses lie in the frame at the link's far end, before the rotation of the next joint: DH frame i+1.
-
-    Attributes:
-        mass: (n,) [kg].
-        centre: (n, 3) [m], centre of mass.
-        inertia: about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3).
-        torque: (n,) [Nm], largest of the joint.
-        radius: (n,) [m] of the link's tube.
-        aside: (n,) [m] offset of the tube from its joints, along the joint's axis.
-        payload: rated load [kg].
     """
 
-    mass: FloatArray
-    centre: FloatArray
-    inertia: FloatArray
-    torque: FloatArray
-    radius: FloatArray
-    aside: FloatArray
-    payload: float
+    mass: FloatArray  # (n,) [kg]
+    centre: FloatArray  # (n, 3) [m], centre of mass
+    inertia: FloatArray  # about it [kg m²]: (n, 2), across the link and along it; or (n, 3, 3)
+    torque: FloatArray  # (n,) [Nm], largest of the joint
+    radius: FloatArray  # (n,) [m] of the link's tube
+    aside: FloatArray  # (n,) [m] offset of the tube from its joints, along the joint's axis
+    payload: float  # rated load [kg]
 
     def __post_init__(self) -> None:
         """Check the shapes and freeze the arrays."""

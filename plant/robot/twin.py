@@ -108,15 +108,10 @@ class TwinFile:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A robot as it was identified from a log.
+    """A robot as it was identified from a log."""
 
-    Attributes:
-        path: of the file.
-        keys: of the file.
-    """
-
-    path: Path
-    keys: TwinFile
+    path: Path  # of the file
+    keys: TwinFile  # of the file
 
     def values(self, seed: int) -> dict[str, float]:
         """Return the parameters of a run with a seed by name."""

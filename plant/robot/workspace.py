@@ -104,17 +104,11 @@ STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
 
 @dataclass(frozen=True, eq=False)
 class Tubes:
-    """The tubes of an arm.
+    """The tubes of an arm."""
 
-    Attributes:
-        link: (s,), the index of each tube's link.
-        ends: (s, 2, 3) [m], in the frame of the link.
-        radius: (s,) [m].
-    """
-
-    link: npt.NDArray[np.intp]
-    ends: FloatArray
-    radius: FloatArray
+    link: npt.NDArray[np.intp]  # (s,), the index of each tube's link
+    ends: FloatArray  # (s, 2, 3) [m], in the frame of the link
+    radius: FloatArray  # (s,) [m]
 
     def placed(self, frames: FloatArray) -> FloatArray:
         """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
