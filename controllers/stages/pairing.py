@@ -8,13 +8,19 @@ the filter that predicts best has the delay:
     Δy ≈ M x_d + E Δq_d                          P ← P + diag(w² ‖x_d‖, u² ‖Δq_d‖)
     d = argmin ℓ_d, once it is better than the present one by a margin; motions that tell no delays apart are left out
 
+A false frame shows once a later one is seen, by ν of the motion since the last frame that was believed, the anchor:
+
+    ν_d = Δy + e − M x_d − E Δq_d                the frame is doubtful if ‖ν_d‖² > g σ² for every delay d of its end,
+    ‖ν‖² < ½ min_d ‖ν_d‖² of the one before      and false then: learned is from the anchor as if it had been lost
+
+σ keeps the innovations of false frames, as it would stay too small without all large ones.
 E belongs to it: where the model is wrong by more than a map, filters without E take the error for noise, and find the
 delay at which it happens to be smallest. The first sample of the noise σ is a guess (`noise_level`). A regression over
 the motions that the delay pairs then gives the Jacobian.
 """
 
 import math
-from typing import Final, NamedTuple, Self, final
+from typing import Final, NamedTuple, Self, cast, final
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +48,9 @@ MAX_GAP = 16  # longest motion over lost frames from which is learned, in motion
 MIN_CHANGE_RATIO = 0.8  # [1] of a motion's change between candidates to noise, above which delays differ
 MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
 RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
+DOUBT: Final = 100.0  # [1] g
+RETURN: Final = 0.5  # [1] of ‖ν‖² at a later frame to that of a doubtful one
+DOUBTFUL = 4  # longest motion with doubtful frames, in motions of the least length
 MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
 REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
@@ -82,9 +91,10 @@ class Candidates:
         """Return the past (..., H, columns) at each delay, (..., D, columns)."""
         return self._between(*(past[..., rows, :] for rows in self._around))
 
-    def begins(self, past: FloatArray, periods: IntArray) -> FloatArray:
-        """Return the past (..., H, columns) at each delay and `periods` (...) before, (..., D, columns)."""
-        return self._between(*(pick(past, rows + periods[..., None], axes=1) for rows in self._around))
+    def begins(self, past: FloatArray, periods: FloatArray) -> FloatArray:
+        """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns)."""
+        whole = np.rint(periods).astype(np.int_)[..., None]
+        return self._between(*(pick(past, rows + whole, axes=1) for rows in self._around))
 
     def exposed(self, past: FloatArray, candidate: IntArray) -> FloatArray:
         """Return the past (..., H, columns) at a candidate delay (...) and a period before, (..., 2, columns)."""
@@ -94,6 +104,25 @@ class Candidates:
 
     def _between(self, row: FloatArray, before: FloatArray | None = None) -> FloatArray:
         return row if before is None else np.asarray(row + self._share[:, None] * (before - row))
+
+
+class Known(NamedTuple):
+    """What returns with an anchor; as in `PairState`."""
+
+    bank: FloatArray
+    scores: FloatArray
+    candidate: IntArray
+    regression: RegressionState
+
+
+class Anchor(NamedTuple):
+    """The last frame that was believed, and the motion since then if the frames of it are doubtful."""
+
+    known: Known  # at the anchor
+    step: FloatArray  # Δy, (..., m)
+    duration: FloatArray  # (...), s
+    valid: BoolArray  # (..., m), features that were measured at both ends
+    miss: FloatArray  # min_d ‖ν_d‖², (...), of the last frame; 0 where it is the anchor
 
 
 class PairState(NamedTuple):
@@ -107,6 +136,13 @@ class PairState(NamedTuple):
     candidate: IntArray  # index of the delay, (...)
     nis: FloatArray  # ‖ν‖²/s of the last motion per feature, (...)
     regression: RegressionState  # over the paired motions
+    anchor: Anchor  # from which false frames are found
+
+    def anchored(self) -> Self:
+        """Return the state with its last frame as the anchor."""
+        known = Known(*(getattr(self, name) for name in Known._fields))
+        none = np.zeros((*np.shape(self.candidate), self.base.shape[-2]))
+        return self._replace(anchor=Anchor(known, none, none[..., 0], none == 0.0, none[..., 0]))
 
 
 class Paired(NamedTuple):
@@ -166,7 +202,8 @@ class Pairing:
             self._candidates = Candidates(np.array([given]))
         self.delays = self._candidates.delays
         self.gap = MAX_GAP * motion
-        self._rows = self._candidates.longest + self.gap + 3
+        self._doubtful = (DOUBTFUL * motion + 0.5) * spec.period
+        self._rows = self._candidates.longest + self.gap + DOUBTFUL * motion + 3
         self.regression = Regression(knowledge)
         self._variances = np.concatenate([np.ones(self._m), np.full(self._n, REST_DEVIATION**2)])
 
@@ -176,16 +213,15 @@ class Pairing:
         none, frame = np.zeros(lead, dtype=np.int_)[()], self._aids.feature_noise**2
         row = np.concatenate([q, np.zeros((*lead, m))], axis=-1)
         bank = fresh_bank(np.eye(m, m + self._n), self._variances, frame)
-        return PairState(
-            past=np.repeat(row[..., None, :], self._rows, axis=-2),
-            base=base,
+        known = Known(
             bank=np.broadcast_to(bank, (*lead, len(self.delays), *bank.shape)),
             scores=np.zeros((*lead, len(self.delays))),
-            noise=NoiseLevel.start(self._aids.feature_noise, lead),
             candidate=none,
-            nis=np.zeros(lead)[()],
             regression=self.regression.start(lead, frame),
         )
+        past, unset = np.repeat(row[..., None, :], self._rows, axis=-2), cast("Anchor", None)
+        noise = NoiseLevel.start(self._aids.feature_noise, lead)
+        return PairState(past, base, noise=noise, nis=np.zeros(lead)[()], anchor=unset, **known._asdict()).anchored()
 
     def advance(self, state: PairState, joint_position: FloatArray, base: FloatArray) -> PairState:
         """Return the state one period later, with the arm at `joint_position` (..., n), rad, and J_n there."""
@@ -226,8 +262,28 @@ class Pairing:
             valid: features that were measured at both ends, (..., m); others are taken to move as foreseen, the noise
                 of their last frame included.
         """
-        n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
-        begin, end = self._candidates.begins(state.past, periods), self._candidates.ends(state.past)
+        anchor, end = state.anchor, self._candidates.ends(state.past)
+        step, total = anchor.step + feature_step, anchor.duration + duration
+        since = anchor._replace(step=step, duration=total, valid=anchor.valid & valid)
+        first = self._candidates.begins(state.past, total / self._period)
+        miss = self._miss(None, since, first, pick(end, anchor.known.candidate)[..., None, :])
+        back = (miss < RETURN * anchor.miss) & np.logical_and.reduce(since.valid == anchor.valid, axis=-1)
+        state = branch(back, lambda now, known: now._replace(**known._asdict()), state, anchor.known)
+        motion = branch(back, lambda _, whole: whole, (feature_step, duration, valid), (step, total, since.valid))
+        periods, shorter = duration / self._period, (anchor.miss > 0.0) & ~back
+        begin = branch(shorter, lambda _, *last: self._candidates.begins(*last), first, state.past, periods)
+        state, paired = self._learned(state, motion, begin, end)
+        least, state = DOUBT * state.noise.variance, state.anchored()
+        doubtful = ~back & (total < self._doubtful) & (miss > least)
+        since = since._replace(miss=branch(doubtful, self._miss, miss, since, first, end))
+        anchor = branch(doubtful & (since.miss > least), lambda _, older: older, state.anchor, since)
+        return state._replace(anchor=anchor), paired
+
+    def _learned(
+        self, state: PairState, motion: tuple[FloatArray, FloatArray, BoolArray], begin: FloatArray, end: FloatArray
+    ) -> tuple[PairState, Paired]:
+        """Return `learn` from a motion that is believed, with the past at both of its ends, (..., D, n + m)."""
+        n, (feature_step, duration, valid) = self._n, motion
         passed = end - begin
         h = np.concatenate([passed[..., n:], passed[..., :n]], axis=-1)
         now = pick(state.bank, state.candidate)[..., : self._m, :]
@@ -243,11 +299,20 @@ class Pairing:
         state = branch(moved, self._forget, state._replace(regression=regression))
         return state, paired
 
+    def _miss(self, _: FloatArray | None, since: Anchor, begin: FloatArray, end: FloatArray) -> FloatArray:
+        """Return the least ‖ν‖², (...), of the motion from `begin` by the delay to each `end`, (..., *, n + m)."""
+        n, m, known = self._n, self._m, since.known
+        passed = end - pick(begin, known.candidate)[..., None, :]
+        W = pick(known.bank, known.candidate)[..., None, :m, :]
+        foreseen = np.matvec(W[..., :m], passed[..., n:]) + np.matvec(W[..., m:-1], passed[..., :n]) - W[..., -1]
+        nu = np.where(since.valid[..., None, :], since.step[..., None, :] - foreseen, 0.0)
+        return np.asarray(np.minimum.reduce(np.vecdot(nu, nu), axis=-1))
+
     def interrupt(self, state: PairState) -> PairState:
         """Return the state after a frame at which no motion ended, without information about its noise."""
         frame = state.noise.variance
         regression = self.regression.interrupt(state.regression, frame)
-        return state._replace(bank=interrupted(state.bank, frame), regression=regression)
+        return state._replace(bank=interrupted(state.bank, frame), regression=regression).anchored()
 
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
         """Return delay [s], noise, NIS, moves of the camera, rotation [rad] of the map, and the deviation of E."""

@@ -181,6 +181,32 @@ def test_lost_frames_do_not_mislead_jacobian_and_delay():
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
 
 
+@pytest.mark.parametrize("false", [[12], [12, 13], [12, 17, 18, 19, 26]])
+def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
+    q = path(1.6)
+    y, valid = features(q, np.eye(M), 0), np.full(len(q), True)
+    y += 5e-4 * np.random.default_rng(5).normal(size=y.shape)
+    valid[false] = False
+    lost = Following(noise="given", feature_noise=5e-4).follow(q, y, valid)
+    y[false] += np.array([0.3, -0.1, 0.2])
+    made = Following(noise="given", feature_noise=5e-4).follow(q, y)
+    for now, wanted in ((made.pair, lost.pair), (made.pair.regression, lost.pair.regression)):
+        np.testing.assert_allclose(now.bank, wanted.bank, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(now.scores, wanted.scores, rtol=1e-9)
+
+
+def test_a_frame_that_another_delay_explains_is_not_taken_for_a_false_one():
+    q = path(1.6)
+    y = features(q, np.eye(M), 0)
+    made = Following(noise="given", feature_noise=5e-4).follow(q[:24], y[:24])
+    before = made.pair.anchor.miss
+    made.see(q[24], y[21])  # it comes three periods late
+    assert np.linalg.norm(y[24] - y[21]) > 0.02
+    assert before == made.pair.anchor.miss == 0.0
+    made.see(q[25], y[25] + 0.1)
+    assert made.pair.anchor.miss > 0.0
+
+
 @pytest.mark.parametrize("period", [0.05, 0.008])
 def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(period):
     q = path(5.0, period)
