@@ -253,7 +253,7 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
     """
     manifest, found = results.read_manifest(folders[0]), list[tuple[range, Path]]()
     for folder in folders:
-        results.check_folder(folder)
+        results.load_runs(folder)  # refuses a table of anything else, whose names are of files
         check_same_batch(folder, manifest, note, remedy="leave it away")
         if not (parts := results.finished_runs(folder)):
             raise ConfigurationError(f"{folder} holds no part of a batch but a whole one, with nothing to be merged")
@@ -379,15 +379,15 @@ def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
     Args:
         there: manifest of the folder; a file that it does not mention counts as unchanged.
-        here: manifest of the new batch.
+        here: manifest of the new batch, or of another folder.
     """
-    for name, digest in here["files"].items():
+    for name, digest in here.get("files", {}).items():
         if there.get("files", {}).get(name, digest) != digest:
             return str(name)
     for key in SOURCES:
         for name, record in here.get(key, {}).items():
             if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
-                return str(record["place"])
+                return str(record.get("place", name))
     return ""
 
 

@@ -266,6 +266,7 @@ def describe_missing(folder: Path) -> str:
     Raises:
         ConfigurationError: as for `load_runs`.
     """
+    check_folder(folder)
     count = sum(tables.row_count(folder, name) for name in _intact(folder, RUNS))
     return missing_line(count, read_manifest(folder).get("run_count", 0))
 

@@ -100,6 +100,8 @@ def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
     path = folder / name
     try:
         size = path.stat().st_size
+        if not (path.is_file() or path.is_dir()):  # a pipe would be read for ever
+            return "is no file"
         if sums is not None and name in sums and digest(path) in sums[name]:
             return None
         end = _end(path)

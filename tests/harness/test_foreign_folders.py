@@ -54,8 +54,14 @@ def linked(name: str) -> Callable[[Path, Path], None]:
     return make
 
 
-def piped(folder: Path, _victim: Path) -> None:
-    os.mkfifo(signed(folder) / "more.csv")
+def piped(name: str) -> Callable[[Path, Path], None]:
+    """Return what puts a pipe, which would be read for ever, in the place of a name."""
+
+    def make(folder: Path, _victim: Path) -> None:
+        (signed(folder) / name).unlink(missing_ok=True)
+        os.mkfifo(folder / name)
+
+    return make
 
 
 def worded(folder: Path, _victim: Path) -> None:
@@ -78,7 +84,8 @@ HOSTILE = {
     "a link for the report": linked("report.html"),
     "a link for films": linked("recordings"),
     "a link beside the tables": linked("notes.csv"),
-    "a pipe": piped,
+    "a pipe": piped("more.csv"),
+    "a pipe for a part": piped(results.part_name(0, results.RUNS)),
     "words": worded,
     "code": coded,
 }
@@ -88,6 +95,7 @@ COMMANDS = (
     "export {} --out out/csv", "export {} --out out/mcap --format mcap",
     f"shadow {{}} --run {RUN} --controller constant --out out/seen.csv", f"record {{}} --run {RUN} --kinds snapshots",
     "compare --controllers constant --plants kinematic --tasks exp1 --workers 1 --resume --out {}", "collect {}",
+    "merge {} --out out/merged", "sweep --controllers constant --plants kinematic --seeds 0:1 --resume --out {}",
 )  # fmt: skip
 
 
@@ -115,6 +123,15 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path
             assert said.err.count("\n") <= 1, command
     assert victim.read_text() == before
     assert not list(tmp_path.rglob("escaped*"))
+
+
+def test_no_picture_is_merged_to_a_place_that_a_run_names(tmp_path, monkeypatch, capsys):
+    (signed(tmp_path / "home" / "folder", run_id="../../picture") / "pictures").mkdir()
+    (tmp_path / "home" / "picture.png").write_text("somebody's")
+    (tmp_path / "out").mkdir()
+    assert servobench(monkeypatch, "merge", f"{tmp_path}/home/folder", "--out", f"{tmp_path}/out/merged") == 2
+    assert "is unfit for the name of a file" in capsys.readouterr().err
+    assert not list((tmp_path / "out").rglob("*.png"))
 
 
 def test_a_spreadsheet_runs_no_cell_of_an_export(tmp_path, monkeypatch):
