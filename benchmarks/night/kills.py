@@ -28,12 +28,13 @@ from kit.command import judged, left_behind
 from night import hostile_controllers
 from servobench.harness.batch.processes import descendants
 
+VICTIMS: Final = ("command", "below it", "runner")
 SIGNALS: Final = ("KILL", "TERM", "INT", "HUP", "QUIT", "STOP")
 MARK: Final = "SERVOBENCH_KILLS"  # an environment variable that everything started here inherits
 SOON: Final = 5.0  # [s] until nothing is left of a command that has ended
 LONG: Final = 15.0  # [s] until what is left then is ended here
 PATIENCE: Final = 600.0  # [s] for a call to end by itself
-LATEST: Final = 9.0  # [s] of a call until its first signal at the latest, and between two signals
+LATEST: Final = 4.0  # [s] from the start of a victim, or the last signal, to the next one at the latest
 BATCHES: Final = (f"{hostile_controllers.__file__}:Quiet,constant", "constant,calibrated")
 
 
@@ -65,18 +66,20 @@ class Sweep:
     def complain(self, code: int) -> str:
         """Return the fault of a call that has ended: a trace, or an end that it should not have."""
         said = self.folder.with_suffix(".txt").read_text(errors="replace")
-        return said[-1500:] if "Traceback" in said or code not in (0, 1, 130, -1, -3, -9, -15) else ""
+        told = code in (0, 1, 130, -1, -2, -3, -9, -15) or "was ended while it started: SIG" in said
+        return "" if told and "Traceback" not in said else said[-1500:]
 
 
 def signalled(sweep: Sweep, process: subprocess.Popen[bytes], source: random.Random, found: Outcome) -> bool:
     """Send a signal at a random instant; return whether there was one before the sweep was over."""
-    time.sleep(source.uniform(0.05, LATEST))
+    kind, pause = source.choice(VICTIMS), source.uniform(0.0, LATEST)
+    while process.poll() is None and not _victims(process.pid)[kind]:
+        time.sleep(0.01)
+    time.sleep(pause)
     if process.poll() is not None:
         return False
-    children = descendants(process.pid)
-    near = [each for each in children if _parent(each) == process.pid]
-    victims = {"command": [process.pid], "below it": near, "runner": [each for each in children if each not in near]}
-    kind = source.choice([name for name, each in victims.items() if each])
+    victims = _victims(process.pid)
+    kind = kind if victims[kind] else "command"
     name = source.choice(SIGNALS)
     os.kill(source.choice(victims[kind]), getattr(signal, f"SIG{name}"))
     found.signals[kind, name] += 1
@@ -86,6 +89,12 @@ def signalled(sweep: Sweep, process: subprocess.Popen[bytes], source: random.Ran
             process.kill()
         end(sweep, process, (kind, name), found)
     return True
+
+
+def _victims(command: int) -> dict[str, list[int]]:
+    children = descendants(command)
+    near = [each for each in children if _parent(each) == command]
+    return dict(zip(VICTIMS, ([command], near, [each for each in children if each not in near]), strict=True))
 
 
 def _parent(process: int) -> int:
