@@ -54,19 +54,13 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class Part(Generic[Kind]):
-    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it.
+    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it."""
 
-    Attributes:
-        config: its settings, a frozen dataclass with a default for every field.
-        make: its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`.
-        needs_truth: whether it needs the true Jacobian.
-        trained: whether it starts from networks that are trained offline.
-    """
-
-    config: type[Any]
+    config: type[Any]  # its settings, a frozen dataclass with a default for every field
+    # its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`
     make: Callable[..., Kind]
-    needs_truth: bool = False
-    trained: bool = False
+    needs_truth: bool = False  # whether it needs the true Jacobian
+    trained: bool = False  # whether it starts from networks that are trained offline
 
 
 ESTIMATORS: dict[str, Part[Estimator[Any]]] = {

@@ -38,23 +38,15 @@ def default_actuation(robot: Robot | None = None) -> Actuation:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of an export.
+    """Options of an export."""
 
-    Attributes:
-        fmi_version: 2 or 3; each has co-simulation and model exchange.
-        model: arm and camera whose numbers become the start values.
-        actuation: lag, limits and home that become start values.
-        platforms: platforms to compile for.
-        mismatch: text for the documentation that says how the model differs from the nominal one.
-        robot: by its maker's description.
-    """
-
-    fmi_version: int = 2
+    fmi_version: int = 2  # 2 or 3; each has co-simulation and model exchange
+    # arm and camera whose numbers become the start values
     model: RobotModel = field(default_factory=lambda: find_robot(UR5).nominal)
-    actuation: Actuation = field(default_factory=default_actuation)
-    platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
-    mismatch: str = "none"
-    robot: Robot = field(default_factory=lambda: find_robot(UR5))
+    actuation: Actuation = field(default_factory=default_actuation)  # lag, limits and home that become start values
+    platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))  # platforms to compile for
+    mismatch: str = "none"  # text for the documentation that says how the model differs from the nominal one
+    robot: Robot = field(default_factory=lambda: find_robot(UR5))  # by its maker's description
 
     def __post_init__(self) -> None:
         """Check version and platforms."""

@@ -25,20 +25,14 @@ TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
 
 @dataclass(frozen=True)
 class FmuInformation:
-    """Content of an FMU.
+    """Content of an FMU."""
 
-    Attributes:
-        description: the model description, as fmpy reads it.
-        interfaces: those of co-simulation, model exchange and scheduled execution that it offers, each with the names
-            of its capabilities.
-        platforms: folders below binaries/.
-        has_sources: whether it holds its C sources.
-    """
-
-    description: Any
+    description: Any  # the model description, as fmpy reads it
+    # those of co-simulation, model exchange and scheduled execution that it offers, each with the names of its
+    # capabilities
     interfaces: Mapping[str, tuple[str, ...]]
-    platforms: tuple[str, ...]
-    has_sources: bool
+    platforms: tuple[str, ...]  # folders below binaries/
+    has_sources: bool  # whether it holds its C sources
 
 
 def read_information(path: Path) -> FmuInformation:

@@ -17,22 +17,14 @@ MOTION_TIME: Final = 0.05  # [s] shortest motion at any control period, so that 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Motion:
-    """One observed motion, from the last valid feature to the newest one.
+    """One observed motion, from the last valid feature to the newest one."""
 
-    Attributes:
-        joint_position: (..., n), rad, where the motion began.
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        error: e = y_ref − y at the end of the motion, (..., m), m.
-        duration: (...), s.
-        noise: (...), standard deviation of the feature per axis, m; None where it is not identified.
-    """
-
-    joint_position: FloatArray
-    joint_step: FloatArray
-    feature_step: FloatArray
-    error: FloatArray
-    duration: FloatArray
+    joint_position: FloatArray  # (..., n), rad, where the motion began.
+    joint_step: FloatArray  # Δq, (..., n), rad.
+    feature_step: FloatArray  # Δy, (..., m), m.
+    error: FloatArray  # e = y_ref − y at the end of the motion, (..., m), m.
+    duration: FloatArray  # (...), s.
+    # (...), standard deviation of the feature per axis, m; None where it is not identified.
     noise: FloatArray | None = None
 
 

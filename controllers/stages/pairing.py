@@ -155,23 +155,15 @@ class Paired(NamedTuple):
 
 
 class Past(NamedTuple):
-    """The past motion that the predict stage needs.
+    """The past motion that the predict stage needs."""
 
-    Attributes:
-        delay: d, (...), periods.
-        exposed: q(k−d), (..., n), rad.
-        before: q(k−d) − q(k−d−1), (..., n), rad.
-        predicted: J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
-        window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
-        noise: e, (..., m), of the last frame from which was learned.
-    """
-
-    delay: FloatArray
-    exposed: FloatArray
-    before: FloatArray
+    delay: FloatArray  # d, (...), periods.
+    exposed: FloatArray  # q(k−d), (..., n), rad.
+    before: FloatArray  # q(k−d) − q(k−d−1), (..., n), rad.
+    # J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
     predicted: tuple[FloatArray, FloatArray]
-    window: FloatArray
-    noise: FloatArray
+    window: FloatArray  # q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
+    noise: FloatArray  # e, (..., m), of the last frame from which was learned.
 
 
 @final

@@ -25,35 +25,22 @@ LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of fa
 
 @dataclass(frozen=True)
 class Finding:
-    """A damaged file of a results folder.
+    """A damaged file of a results folder."""
 
-    Attributes:
-        name: of the file within the folder.
-        fault: a predicate of the file.
-        remedy: for the user.
-    """
-
-    name: str
-    fault: str
-    remedy: str
+    name: str  # of the file within the folder
+    fault: str  # a predicate of the file
+    remedy: str  # for the user
 
 
 @dataclass(frozen=True)
 class Examination:
-    """The result of an examination of a results folder.
+    """The result of an examination of a results folder."""
 
-    Attributes:
-        findings: damaged files.
-        files: number of examined files.
-        runs: number of intact runs.
-        wanted: number of runs of the batch; 0 where the folder does not tell.
-        left_out: files without a checksum, and results folders within the folder, which are examined one by one.
-    """
-
-    findings: list[Finding]
-    files: int
-    runs: int
-    wanted: int
+    findings: list[Finding]  # damaged files
+    files: int  # number of examined files
+    runs: int  # number of intact runs
+    wanted: int  # number of runs of the batch; 0 where the folder does not tell
+    # files without a checksum, and results folders within the folder, which are examined one by one
     left_out: list[str]
 
 

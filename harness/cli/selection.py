@@ -17,19 +17,14 @@ ALL = "all"
 
 
 class Names(NamedTuple):
-    """The names of a kind.
+    """The names of a kind."""
 
-    Attributes:
-        known: returns all of them.
-        find: refuses a wrong word; a text that it returns is the name that the word stands for.
-        tried: the kind of plants and controllers, of which those of third parties are tried where `all` stands for
-            them; None for other kinds.
-        begun: returns the names that a shell offers for a word, where names are put together from parts.
-    """
-
-    known: Callable[[], Sequence[str]]
-    find: Callable[[str], Any]
+    known: Callable[[], Sequence[str]]  # returns all of them
+    find: Callable[[str], Any]  # refuses a wrong word; a text that it returns is the name that the word stands for
+    # the kind of plants and controllers, of which those of third parties are tried where `all` stands for them; None
+    # for other kinds
     tried: Word | None = None
+    # returns the names that a shell offers for a word, where names are put together from parts
     begun: Callable[[str], Iterable[str]] | None = None
 
 

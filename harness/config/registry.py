@@ -67,23 +67,15 @@ def offered(names: Iterable[str]) -> tuple[Offer, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Registry(Generic[Entry]):
-    """Entries of a kind by name: of this package, given by the user, or published by other distributions.
+    """Entries of a kind by name: of this package, given by the user, or published by other distributions."""
 
-    Attributes:
-        kind: of the entries.
-        group: of the entry points by which others publish them.
-        own: those of this package, or their place `MODULE:NAME` where that loads slowly.
-        made: makes the entry of a name with a meaning of its own; None for other names.
-        advice: about an unknown name; empty for the nearest name.
-        suffixes: of files whose name is `fmu:PATH`.
-    """
-
-    kind: Kind[Entry]
-    group: str
-    own: Mapping[str, Entry | str]
+    kind: Kind[Entry]  # of the entries
+    group: str  # of the entry points by which others publish them
+    own: Mapping[str, Entry | str]  # those of this package, or their place `MODULE:NAME` where that loads slowly
+    # makes the entry of a name with a meaning of its own; None for other names
     made: Callable[[str], Entry | None] = lambda _: None
-    advice: Callable[[str], str] = lambda _: ""
-    suffixes: tuple[str, ...] = ()
+    advice: Callable[[str], str] = lambda _: ""  # about an unknown name; empty for the nearest name
+    suffixes: tuple[str, ...] = ()  # of files whose name is `fmu:PATH`
 
     def names(self) -> list[str]:
         """Return all names, those of this package first."""

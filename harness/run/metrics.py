@@ -71,33 +71,21 @@ class Summary(NamedTuple):
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric: a column of the table of runs.
+    """A metric: a column of the table of runs."""
 
-    Attributes:
-        column: its name.
-        unit: of the column; empty for that of the plant's feature.
-        label: its name wherever it is shown: in tables of commands, in the report and in figures.
-        digits: behind the decimal point where it is shown.
-        meaning: its definition.
-        values: of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.outcome`.
-        percent: whether it is shown in percent.
-        better: `less`, or empty where neither direction is better.
-        tables: the tables of the report that show it, each with the group of columns: moves, curves, cost, runs.
-        figure: the figure that shows it for each run: settling, effort or smoothness.
-        summary: its column in the table that a command prints at its end.
-    """
-
-    column: str
-    unit: str
-    label: str
-    digits: int
-    meaning: str
+    column: str  # its name
+    unit: str  # of the column; empty for that of the plant's feature
+    label: str  # its name wherever it is shown: in tables of commands, in the report and in figures
+    digits: int  # behind the decimal point where it is shown
+    meaning: str  # its definition
+    # of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.outcome`.
     values: Callable[[Judged], FloatArray] | None = None
-    percent: bool = False
-    better: str = "less"
+    percent: bool = False  # whether it is shown in percent
+    better: str = "less"  # `less`, or empty where neither direction is better
+    # the tables of the report that show it, each with the group of columns: moves, curves, cost, runs
     tables: Mapping[str, str] = field(default_factory=dict)
-    figure: str = ""
-    summary: Summary | None = None
+    figure: str = ""  # the figure that shows it for each run: settling, effort or smoothness
+    summary: Summary | None = None  # its column in the table that a command prints at its end
 
     @property
     def shown_unit(self) -> str:

@@ -76,21 +76,14 @@ READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Measurement:
-    """One number behind an answer.
+    """One number behind an answer."""
 
-    Attributes:
-        panel: the measured quantity with its unit.
-        place: task.
-        label: controller, reading or pairing.
-        estimate: value and interval.
-        holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are too
-            few to tell.
-    """
-
-    panel: str
-    place: str
-    label: str
-    estimate: Estimate
+    panel: str  # the measured quantity with its unit
+    place: str  # task
+    label: str  # controller, reading or pairing
+    estimate: Estimate  # value and interval
+    # whether the claim's rule holds here; None for a number that no rule judges, and where the robots are too few to
+    # tell
     holds: bool | None = None
 
 

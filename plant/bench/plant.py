@@ -28,26 +28,17 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class TrueModel:
-    """The kinematics of the true robot and the delays of commands and features; for upper bounds only.
+    """The kinematics of the true robot and the delays of commands and features; for upper bounds only."""
 
-    Attributes:
-        jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
-        symbolic: from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1).
-        latency: between exposure and delivery of a frame, s.
-        command_delay: between a command and its first effect, s.
-        lag: time constant of the joints' velocity loops, s; None where it is unknown.
-        latency_spread: by which a frame may be later than the latency, s.
-        camera_turn: with which the first camera turns about its optical axis, rad/s.
-        tool: natural frequency [rad/s] and damping ratio of a flexible tool; frequency 0 for a rigid one.
-    """
-
-    jacobian: Callable[[FloatArray], FloatArray]
+    jacobian: Callable[[FloatArray], FloatArray]  # (..., n) rad -> (..., m, n), unit of the feature per rad.
+    # from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1)
     symbolic: Callable[[Any], Any]
-    latency: float = 0.0
-    command_delay: float = 0.0
-    lag: float | None = None
-    latency_spread: float = 0.0
-    camera_turn: float = 0.0
+    latency: float = 0.0  # between exposure and delivery of a frame, s
+    command_delay: float = 0.0  # between a command and its first effect, s
+    lag: float | None = None  # time constant of the joints' velocity loops, s; None where it is unknown
+    latency_spread: float = 0.0  # by which a frame may be later than the latency, s
+    camera_turn: float = 0.0  # with which the first camera turns about its optical axis, rad/s
+    # natural frequency [rad/s] and damping ratio of a flexible tool; frequency 0 for a rigid one
     tool: tuple[float, float] = (0.0, 0.0)
 
 
@@ -166,20 +157,16 @@ class Plant(Abilities):
 
 @dataclass(frozen=True)
 class PlantSetup:
-    """The arguments with which the harness builds a plant.
+    """The arguments with which the harness builds a plant."""
 
-    Attributes:
-        model: the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs
-            side by side its arrays have a leading axis.
-        start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
-        period: control period, s.
-        nominal: the robot by its maker's description: limits, links and bench; None for a plant that brings its own,
-            or where only the model is known.
-    """
-
+    # the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs side by
+    # side its arrays have a leading axis.
     model: RobotModel | None
+    # (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
     start: FloatArray | None
-    period: float
+    period: float  # control period, s
+    # the robot by its maker's description: limits, links and bench; None for a plant that brings its own, or where
+    # only the model is known
     nominal: Robot | None = None
 
     @property

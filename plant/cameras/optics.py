@@ -31,20 +31,13 @@ NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """The intrinsics of c cameras.
+    """The intrinsics of c cameras."""
 
-    Attributes:
-        focal: f or f_x, (..., c) [px].
-        centre: c, (..., c, 2) [px].
-        distortion: k or k₁, (..., c) [1].
-        size: width and height of the images [px].
-        further: f_y/f_x, k₂, p₁, p₂, k₃ and the largest r², (..., c, 6) [1], of calibrated cameras; None of others.
-    """
-
-    focal: FloatArray
-    centre: FloatArray
-    distortion: FloatArray
-    size: tuple[float, float]
+    focal: FloatArray  # f or f_x, (..., c) [px].
+    centre: FloatArray  # c, (..., c, 2) [px].
+    distortion: FloatArray  # k or k₁, (..., c) [1].
+    size: tuple[float, float]  # width and height of the images [px]
+    # f_y/f_x, k₂, p₁, p₂, k₃ and the largest r², (..., c, 6) [1], of calibrated cameras; None of others.
     further: FloatArray | None = None
 
     @property

@@ -153,19 +153,13 @@ ANGLE: Final = {"deg": math.pi / 180.0, "rad": 1.0}
 
 
 class SensorAxis(NamedTuple):
-    """A word for one setting of a sensor.
+    """A word for one setting of a sensor."""
 
-    Attributes:
-        units: its units with their sizes in SI units, NaN of pixels; the empty one for a plain number.
-        example: of a magnitude.
-        setting: its key in `SensingConfig`.
-        family: the family of noise that it chooses; None for none.
-    """
-
+    # its units with their sizes in SI units, NaN of pixels; the empty one for a plain number
     units: Mapping[str, float]
-    example: str
-    setting: str
-    family: Family | None = None
+    example: str  # of a magnitude
+    setting: str  # its key in `SensingConfig`
+    family: Family | None = None  # the family of noise that it chooses; None for none
 
 
 SENSOR_AXES: Final[Mapping[str, SensorAxis]] = {

@@ -26,25 +26,16 @@ IDENTIFIER: Final = re.compile(r"(?!\.)[\w.+ -]{1,200}")
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of an FMU.
+    """A variable of an FMU."""
 
-    Attributes:
-        name: as in the description.
-        reference: value reference.
-        size: how many values it holds.
-        causality: parameter, structuralParameter, input, output, local or independent.
-        type: such as Real, Float32, Int64, Boolean or String.
-        dimensions: sizes of its axes: numbers, or names of structural parameters with their start values.
-        unit: empty where none is told.
-    """
-
-    name: str
-    reference: int
-    size: int
-    causality: str
-    type: str = "Real"
+    name: str  # as in the description
+    reference: int  # value reference
+    size: int  # how many values it holds
+    causality: str  # parameter, structuralParameter, input, output, local or independent
+    type: str = "Real"  # such as Real, Float32, Int64, Boolean or String
+    # sizes of its axes: numbers, or names of structural parameters with their start values
     dimensions: tuple[tuple[str, int], ...] = ()
-    unit: str = ""
+    unit: str = ""  # empty where none is told
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""

@@ -126,14 +126,11 @@ class MessageLog:
 
 @dataclass(frozen=True)
 class InstanceOptions:
-    """Options of an instance.
+    """Options of an instance."""
 
-    Attributes:
-        tolerance: relative one of its own solver, or of CVode in model exchange; None: the solver's own.
-        debug_log: file to which all of its messages are appended, with its debug log turned on; None: it is off.
-    """
-
+    # relative one of its own solver, or of CVode in model exchange; None: the solver's own
     tolerance: float | None = None
+    # file to which all of its messages are appended, with its debug log turned on; None: it is off
     debug_log: Path | None = None
 
 

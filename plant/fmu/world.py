@@ -58,18 +58,13 @@ class FmuConfig:
 
 @dataclass(frozen=True, eq=False)
 class FmuState:
-    """A saved state of an FMU's world.
+    """A saved state of an FMU's world."""
 
-    Attributes:
-        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
-            world that saved it.
-        period: number of periods since the start.
-        integrated: (..., n), rad, joint positions of an FMU that has none itself.
-    """
-
+    # of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the world
+    # that saved it
     fmu: tuple[bytes | ctypes.c_void_p, ...]
-    period: int
-    integrated: FloatArray
+    period: int  # number of periods since the start
+    integrated: FloatArray  # (..., n), rad, joint positions of an FMU that has none itself.
 
 
 class FmuWorld(World):

@@ -106,16 +106,10 @@ class Simulation(ABC):
 
 
 class Engine(NamedTuple):
-    """A physics engine.
+    """A physics engine."""
 
-    Attributes:
-        scene: for the camera.
-        simulation: for the motion.
-        describe: returns one line about the engine and the library that renders its images.
-        lacking: returns one line about missing parts of this machine; empty if nothing is missing.
-    """
-
-    scene: type[Scene]
-    simulation: Callable[[Machine], Simulation]
-    describe: Callable[[], str]
+    scene: type[Scene]  # for the camera
+    simulation: Callable[[Machine], Simulation]  # for the motion
+    describe: Callable[[], str]  # returns one line about the engine and the library that renders its images
+    # returns one line about missing parts of this machine; empty if nothing is missing
     lacking: Callable[[], str] = str

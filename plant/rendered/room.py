@@ -33,19 +33,13 @@ OVERVIEW_CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Positions of the target and the cameras of a set-up.
+    """Positions of the target and the cameras of a set-up."""
 
-    Attributes:
-        target: (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame.
-        hand: (c, 4, 4), poses of the cameras in the flange frame; None where they are beside the arm and not drawn.
-        scale: of all lengths, over those of a UR5's bench.
-        ball_radius: [m].
-    """
-
-    target: FloatArray
+    target: FloatArray  # (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame
+    # (c, 4, 4), poses of the cameras in the flange frame; None where they are beside the arm and not drawn
     hand: FloatArray | None
-    scale: float
-    ball_radius: float
+    scale: float  # of all lengths, over those of a UR5's bench
+    ball_radius: float  # [m]
 
     @classmethod
     def of(cls, model: SetupModel, robot: Robot) -> Self | None:

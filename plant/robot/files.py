@@ -193,17 +193,11 @@ DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 
 
 class Joint(NamedTuple):
-    """A rotating joint of the chain.
+    """A rotating joint of the chain."""
 
-    Attributes:
-        joint: as yourdfpy reads it.
-        origin: (4, 4), the joint in the frame of the turning joint before it, whose z axis is its own.
-        aligned: (4, 4), the frame whose z axis is the joint's axis, in the frame of the joint's child link.
-    """
-
-    joint: Any
-    origin: FloatArray
-    aligned: FloatArray
+    joint: Any  # as yourdfpy reads it
+    origin: FloatArray  # (4, 4), the joint in the frame of the turning joint before it, whose z axis is its own
+    aligned: FloatArray  # (4, 4), the frame whose z axis is the joint's axis, in the frame of the joint's child link
 
 
 def read_urdf_robot(path: Path, tip: str = "") -> Robot:

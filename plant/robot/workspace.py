@@ -36,32 +36,20 @@ Move = tuple[FloatArray, FloatArray]  # start and target, (n,) and (n,) [rad]
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """The part of a robot's reach in which tasks are placed.
+    """The part of a robot's reach in which tasks are placed."""
 
-    Attributes:
-        scale: of all lengths, over those of a UR5's bench.
-        centre: (3,) [m], base frame; the camera looks at it and turns about it.
-        shoulder: (3,) [m], base frame.
-        home: (n,) [rad], the start of most runs.
-        lower: (n,) [rad], lower corner of the box in which networks are trained and random moves are drawn.
-        upper: (n,) [rad].
-        moves: start and target of the moves by name.
-        stretched: (n,) [rad], a start at which the Jacobian is nearly singular.
-        clear: returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None
-            where all of the box is.
-        ball: radius of a ball of the user's [m]; None for that of the bench.
-    """
-
-    scale: float
-    centre: FloatArray
-    shoulder: FloatArray
-    home: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    moves: Mapping[str, Move]
-    stretched: FloatArray
+    scale: float  # of all lengths, over those of a UR5's bench
+    centre: FloatArray  # (3,) [m], base frame; the camera looks at it and turns about it
+    shoulder: FloatArray  # (3,) [m], base frame
+    home: FloatArray  # (n,) [rad], the start of most runs
+    lower: FloatArray  # (n,) [rad], lower corner of the box in which networks are trained and random moves are drawn
+    upper: FloatArray  # (n,) [rad]
+    moves: Mapping[str, Move]  # start and target of the moves by name
+    stretched: FloatArray  # (n,) [rad], a start at which the Jacobian is nearly singular
+    # returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None where
+    # all of the box is.
     clear: Clear | None = None
-    ball: float | None = None
+    ball: float | None = None  # radius of a ball of the user's [m]; None for that of the bench
 
     @property
     def camera_distance(self) -> float:
@@ -133,29 +121,18 @@ def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """Decides whether postures are fit to work in; `scale` is that of the workspace.
+    """Decides whether postures are fit to work in; `scale` is that of the workspace."""
 
-    Attributes:
-        arm: the nominal arm.
-        tubes: of its links.
-        lower: (n,) [rad], its stops.
-        upper: (n,) [rad].
-        X_BC: (4, 4), the camera.
-        scale: of all lengths over those of a UR5's bench.
-        ball_radius: [m].
-        pairs: (p, 2), tubes that must not meet.
-        camera: its image.
-    """
-
-    arm: SerialArm
-    tubes: Tubes
-    lower: FloatArray
-    upper: FloatArray
-    X_BC: FloatArray
-    scale: float
-    ball_radius: float
+    arm: SerialArm  # the nominal arm
+    tubes: Tubes  # of its links
+    lower: FloatArray  # (n,) [rad], its stops
+    upper: FloatArray  # (n,) [rad]
+    X_BC: FloatArray  # (4, 4), the camera
+    scale: float  # of all lengths over those of a UR5's bench
+    ball_radius: float  # [m]
+    # (p, 2), tubes that must not meet
     pairs: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
-    camera: PinholeCamera = CAMERA
+    camera: PinholeCamera = CAMERA  # its image
 
     def __call__(self, joint_position: FloatArray, *, singular: bool = False) -> BoolArray:
         """Return whether joint positions (..., n) rad are fit to work in, (...).

@@ -49,27 +49,17 @@ _any = np.logical_or.reduce  # the method `any` of an array takes twice as long
 
 @dataclass(frozen=True, eq=False)
 class QpShape:
-    """The part of a program that is the same in every period.
+    """The part of a program that is the same in every period."""
 
-    Attributes:
-        weights: w, (H,), weights of the predicted errors; in constant-move mode only their number counts.
-        move_weight: diagonal of Q, (n,).
-        constant_gain: a of eq. 46 in constant-move mode, None for H free moves.
-        largest_move: (n,), rad.
-        largest_change: (n,), rad, largest change from one move to the next; None for no limit, of the first move too.
-        limit_position: whether the joint positions are limited.
-        view_rows: V, (v, m); no rows = no limit on the view.
-        varying_jacobian: whether every block has a Jacobian of its own; for free moves only.
-    """
-
-    weights: FloatArray
-    move_weight: FloatArray
-    constant_gain: float | None
-    largest_move: FloatArray
+    weights: FloatArray  # w, (H,), weights of the predicted errors; in constant-move mode only their number counts
+    move_weight: FloatArray  # diagonal of Q, (n,)
+    constant_gain: float | None  # a of eq. 46 in constant-move mode, None for H free moves.
+    largest_move: FloatArray  # (n,), rad
+    # (n,), rad, largest change from one move to the next; None for no limit, of the first move too
     largest_change: FloatArray | None
-    limit_position: bool
-    view_rows: FloatArray
-    varying_jacobian: bool = False
+    limit_position: bool  # whether the joint positions are limited
+    view_rows: FloatArray  # V, (v, m); no rows = no limit on the view
+    varying_jacobian: bool = False  # whether every block has a Jacobian of its own; for free moves only
 
     def __eq__(self, other: object) -> bool:
         """Return whether all entries are equal."""
@@ -116,24 +106,16 @@ class QpBounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class QpSolution:
-    """The result of a solver.
+    """The result of a solver."""
 
-    Attributes:
-        success: whether the rest can be used.
-        moves: (moves, n), rad.
-        objective: value of the criterion, m².
-        multiplier: (moves·n + rows,), of the moves and of those rows that are within reach: positive at an upper bound,
-            negative at a lower one.
-        status: the solver's own word.
-        iterations: of the solver.
-    """
-
-    success: bool
-    moves: FloatArray
-    objective: float
+    success: bool  # whether the rest can be used
+    moves: FloatArray  # (moves, n), rad
+    objective: float  # value of the criterion, m²
+    # (moves·n + rows,), of the moves and of those rows that are within reach: positive at an upper bound, negative at
+    # a lower one
     multiplier: FloatArray
-    status: str
-    iterations: float
+    status: str  # the solver's own word
+    iterations: float  # of the solver
 
 
 def view_rows(tangent: tuple[float, ...], m: int) -> FloatArray:
