@@ -157,16 +157,20 @@ class Plant(Abilities):
 
 @dataclass(frozen=True)
 class PlantSetup:
-    """The arguments with which the harness builds a plant."""
+    """The arguments with which the harness builds a plant.
 
-    # the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs side by
-    # side its arrays have a leading axis.
+    Attributes:
+        model: the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs
+            side by side its arrays have a leading axis.
+        start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
+        period: control period, s.
+        nominal: the robot by its maker's description: limits, links and bench; None for a plant that brings its own,
+            or where only the model is known.
+    """
+
     model: RobotModel | None
-    # (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
     start: FloatArray | None
-    period: float  # control period, s
-    # the robot by its maker's description: limits, links and bench; None for a plant that brings its own, or where
-    # only the model is known
+    period: float
     nominal: Robot | None = None
 
     @property
