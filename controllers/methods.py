@@ -117,28 +117,20 @@ class TrainedMethodConfig(MethodConfig):
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table of methods.
+    """A row of the table of methods."""
 
-    Attributes:
-        name: the word on the command line.
-        law: a name in `LAWS`.
-        estimator: a name in `ESTIMATORS`.
-        summary: one line for `servobench controllers`.
-        law_defaults: settings of the law that differ from its own defaults.
-        aids: settings of the aids that differ from none.
-        printed: settings of the law as published that differ from its own defaults; None: it is not published.
-        estimator_defaults: settings of the estimator that differ from its own defaults where there are aids.
-        network_defaults: those of the controller network's training, likewise.
-    """
-
-    name: str
-    law: str
-    estimator: str
-    summary: str
+    name: str  # the word on the command line
+    law: str  # a name in `LAWS`
+    estimator: str  # a name in `ESTIMATORS`
+    summary: str  # one line for `servobench controllers`
+    # settings of the law that differ from its own defaults
     law_defaults: Mapping[str, object] = field(default_factory=dict)
-    aids: Mapping[str, Any] = field(default_factory=dict)
+    aids: Mapping[str, Any] = field(default_factory=dict)  # settings of the aids that differ from none
+    # settings of the law as published that differ from its own defaults; None: it is not published
     printed: Mapping[str, object] | None = None
+    # settings of the estimator that differ from its own defaults where there are aids
     estimator_defaults: Mapping[str, object] = field(default_factory=dict)
+    # those of the controller network's training, likewise
     network_defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def divisions(self) -> list[Self]:

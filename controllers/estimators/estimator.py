@@ -29,12 +29,9 @@ class Motion:
 
 
 class Estimator(ABC, Generic[State]):
-    """Estimates J = ∂y/∂q from motions; any estimator works with any law.
+    """Estimates J = ∂y/∂q from motions; any estimator works with any law."""
 
-    Attributes:
-        brings_model: whether it knows a Jacobian for every joint position by itself, so that no other model is added.
-    """
-
+    # whether it knows a Jacobian for every joint position by itself, so that no other model is added
     brings_model: ClassVar[bool] = False
 
     @abstractmethod

@@ -18,26 +18,18 @@ State = TypeVar("State")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """The message from the estimator to the law in each period.
+    """The message from the estimator to the law in each period."""
 
-    Attributes:
-        jacobian: Ĵ, (..., m, n), m/rad, at the present joint position.
-    """
-
-    jacobian: FloatArray
+    jacobian: FloatArray  # Ĵ, (..., m, n), m/rad, at the present joint position.
 
 
 class Law(ABC, Generic[State]):
-    """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator.
+    """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator."""
 
-    Attributes:
-        owns: the stages of the chain that the law brings itself, so that a controller may not add another one;
-            "preview": it looks at more of the reference than the present row.
-        in_model_frame: whether it was trained on the nominal model, so that it works in that model's frame.
-    """
-
+    # the stages of the chain that the law brings itself, so that a controller may not add another one; "preview": it
+    # looks at more of the reference than the present row
     owns: frozenset[Stage] = frozenset()
-    in_model_frame: bool = False
+    in_model_frame: bool = False  # whether it was trained on the nominal model, so that it works in that model's frame
 
     @abstractmethod
     def start(self, observation: Observation) -> State:

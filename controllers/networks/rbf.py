@@ -79,17 +79,11 @@ def information_vector(errors: FloatArray, positions: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class JacobianNetwork:
-    """n Gaussian networks, one for each joint column of the Jacobian.
+    """n Gaussian networks, one for each joint column of the Jacobian."""
 
-    Attributes:
-        centres: c, (n, L, n), rad; `centres[i, l]` is a joint position at which unit l of column i is 1.
-        widths: δ, (n, L), rad, positive.
-        weights: W, (n, m, L), m/rad; `weights[i]` maps the units of column i to the column.
-    """
-
-    centres: FloatArray
-    widths: FloatArray
-    weights: FloatArray
+    centres: FloatArray  # c, (n, L, n), rad; `centres[i, l]` is a joint position at which unit l of column i is 1
+    widths: FloatArray  # δ, (n, L), rad, positive
+    weights: FloatArray  # W, (n, m, L), m/rad; `weights[i]` maps the units of column i to the column
 
     def __post_init__(self) -> None:
         """Check that the three arrays fit together and freeze them."""
@@ -192,27 +186,16 @@ class JacobianNetwork:
 
 @dataclass(frozen=True, eq=False)
 class ControllerNetwork:
-    """p = m L_e + n L_c networks on one hidden layer, one for each column of the controller matrix ψ.
+    """p = m L_e + n L_c networks on one hidden layer, one for each column of the controller matrix ψ."""
 
-    Attributes:
-        centres: c, (N_h, p), m and rad, points in the space of ξ.
-        widths: γ, (N_h,), positive.
-        weights: W, (n, p, N_h); `weights[:, j]` maps the hidden layer to the column ψ_j.
-        error_history: L_e, how many errors ξ holds.
-        position_history: L_c, how many joint positions ξ holds.
-        kernel: of the hidden layer, see `hidden_features`.
-        step: between the instants of ξ, and from q to the position ψ ξ [s].
-        offset_free: whether `origin` is the trained network's own command at rest.
-    """
-
-    centres: FloatArray
-    widths: FloatArray
-    weights: FloatArray
-    error_history: int
-    position_history: int
-    kernel: Kernel = "exponential"
-    step: float = STEP
-    offset_free: bool = False
+    centres: FloatArray  # c, (N_h, p), m and rad, points in the space of ξ
+    widths: FloatArray  # γ, (N_h,), positive
+    weights: FloatArray  # W, (n, p, N_h); `weights[:, j]` maps the hidden layer to the column ψ_j
+    error_history: int  # L_e, how many errors ξ holds
+    position_history: int  # L_c, how many joint positions ξ holds
+    kernel: Kernel = "exponential"  # of the hidden layer, see `hidden_features`
+    step: float = STEP  # between the instants of ξ, and from q to the position ψ ξ [s]
+    offset_free: bool = False  # whether `origin` is the trained network's own command at rest
 
     def __post_init__(self) -> None:
         """Check that arrays and sizes fit together and freeze the arrays."""

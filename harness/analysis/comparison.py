@@ -48,19 +48,12 @@ def number(value: float, spec: str) -> str:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval; `f"{estimate:.2f}"` is `0.75 [0.70, 0.80]`.
+    """A number with its interval; `f"{estimate:.2f}"` is `0.75 [0.70, 0.80]`."""
 
-    Attributes:
-        value: the estimate.
-        low: lower end; NaN where the sample is too small for an interval.
-        high: upper end, likewise.
-        count: size of the sample; 0 where there is no number.
-    """
-
-    value: float
-    low: float
-    high: float
-    count: int
+    value: float  # the estimate
+    low: float  # lower end; NaN where the sample is too small for an interval
+    high: float  # upper end, likewise
+    count: int  # size of the sample; 0 where there is no number
 
     def __format__(self, spec: str) -> str:
         """Return value and interval, each formatted with `spec`; ∞ for infinity, no interval where there is none."""

@@ -149,15 +149,11 @@ def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class HandEyeModel(RobotModel):
-    """A serial arm under a fixed camera, eye to hand.
+    """A serial arm under a fixed camera, eye to hand."""
 
-    Attributes:
-        arm: the arm with the ball on its flange.
-        X_BC: (..., 4, 4), camera in the base frame, with the leading axes of the arm's arrays; z along the optical
-            axis, x right and y down in the image.
-    """
-
-    arm: SerialArm
+    arm: SerialArm  # the arm with the ball on its flange
+    # (..., 4, 4), camera in the base frame, with the leading axes of the arm's arrays; z along the optical axis, x
+    # right and y down in the image.
     X_BC: FloatArray
 
     def __post_init__(self) -> None:

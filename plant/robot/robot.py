@@ -51,35 +51,20 @@ class Links:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot by its maker's description.
+    """A robot by its maker's description."""
 
-    Attributes:
-        name: in tables, names of files and of FMUs.
-        title: in texts, such as "UR5".
-        source: where the numbers come from.
-        arm: the nominal arm with the ball on its flange.
-        limits: of its joints, by its maker.
-        links: masses and shapes.
-        workspace: where it works, and where the camera hangs.
-        measured: the arm as its factory measured it; None where only the nominal one is known.
-        note: a line for the user about assumptions; empty for none.
-        known: whether controllers may know it; of another one they know joints and features alone.
-        camera: of the user, in place of the bench's; None for none.
-        twin: the true robot as identified from a log, in place of mismatches; None for none.
-    """
-
-    name: str
-    title: str
-    source: str
-    arm: SerialArm
-    limits: JointLimits
-    links: Links
-    workspace: Workspace
-    measured: SerialArm | None = None
-    note: str = ""
-    known: bool = True
-    camera: OwnCamera | None = None
-    twin: Twin | None = None
+    name: str  # in tables, names of files and of FMUs
+    title: str  # in texts, such as "UR5"
+    source: str  # where the numbers come from
+    arm: SerialArm  # the nominal arm with the ball on its flange
+    limits: JointLimits  # of its joints, by its maker
+    links: Links  # masses and shapes
+    workspace: Workspace  # where it works, and where the camera hangs
+    measured: SerialArm | None = None  # the arm as its factory measured it; None where only the nominal one is known
+    note: str = ""  # a line for the user about assumptions; empty for none
+    known: bool = True  # whether controllers may know it; of another one they know joints and features alone
+    camera: OwnCamera | None = None  # of the user, in place of the bench's; None for none
+    twin: Twin | None = None  # the true robot as identified from a log, in place of mismatches; None for none
 
     @property
     def n(self) -> int:
