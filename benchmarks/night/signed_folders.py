@@ -211,17 +211,16 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     os.chdir(place)
     tempfile.tempdir = str(place / "temporary")
     os.environ["XDG_CACHE_HOME"] = str(place / "cache")
-    faults = []
+    faults, changed = [], not (signed or _same_files(folder, good))
     drawn_commands = source.choices(list(COMMANDS), list(COMMANDS.values()), k=2)
     for command in sorted(drawn_commands, key=lambda each: "--resume" in each):  # which mends the folder
-        faults += [(command, fault) for fault in _faults(command, folder, good, wanted, signed=signed)]
+        faults += [(command, fault) for fault in _faults(command, folder, good, wanted, changed=changed)]
     if (place / "home" / "victim.csv").read_text() != "precious" or len(list((place / "home").iterdir())) > 2:
         faults.append(("", "outside: the home of the folder was changed"))
     return faults
 
 
-def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *, signed: bool) -> list[str]:
-    changed = not (signed or _same_files(folder, good))
+def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *, changed: bool) -> list[str]:
     place = folder.parents[1]
     shutil.rmtree(place / "out" / "csv", ignore_errors=True)
     with noting() as noted:
@@ -239,7 +238,7 @@ def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *
         faults.append("silent: verify takes changed files")
     elif code == 0 and changed and command in UNCHANGED and _output(command, out, place) != wanted[f"{good}{command}"]:
         faults.append("silent: another output of a changed folder")
-    elif code == 0 and signed and command == EXPORT and not _equal_tables(folder, place / "out" / "csv"):
+    elif code == 0 and command == EXPORT and not _equal_tables(folder, place / "out" / "csv"):
         faults.append("silent: an exported table is not that of the folder")
     return faults
 

@@ -236,7 +236,8 @@ class Sandbox:
             resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
         ours, theirs = context.Pipe()
         inherited = (ours,) if self._copied else ()
-        arguments = (self._modules, __name__, "keep_guard", theirs, self._limits, inherited)
+        tracker = getattr(resource_tracker._resource_tracker, "_pid", None)  # Python does not tell it otherwise
+        arguments = (self._modules, __name__, "keep_guard", theirs, self._limits, inherited, tracker)
         process: BaseProcess = context.Process(target=processes.begin, args=arguments)
         with self._lock:
             if self._ended:
@@ -290,14 +291,20 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]) -> None:
-    """Be a guard: take tasks from a link until it closes; `inherited` are ends of links that a copy must not keep."""
+def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection], tracker: int | None) -> None:
+    """Be a guard: take tasks from a link until it closes.
+
+    Args:
+        link: to the process above.
+        limits: of each run.
+        inherited: ends of links that a copy must not keep.
+        tracker: process of Python that tracks the resources of the one above, if there is one.
+    """
     for each in inherited:
         each.close()
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
-    beside = processes.descendants(os.getppid())  # the tracker of resources among them
     gc.freeze()  # so that runners go on sharing the memory of all imports
     guard = _Guard(link, limits)
     try:
@@ -307,7 +314,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
         pass
     finally:
         guard.end_runner()
-        processes.send(beside, signal.SIGCONT)  # a stopped tracker does not notice that it is to end
+        processes.send([tracker] if tracker else [], signal.SIGCONT)  # a stopped one does not notice that it is to end
 
 
 class _Guard:
