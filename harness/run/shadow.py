@@ -234,10 +234,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def _apart(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
-    """Return the share of the motion of features (k, m) that no image of the others explains, and if one is mirrored.
-
-    The share is 0 for short motions. A camera that looks from the other side shows a mirrored image.
-    """
+    """Return the share of the motion of features (k, m) that no image of p explains, or 0, and if y is mirrored."""
     y, p = y - y.mean(axis=0), p - p.mean(axis=0)
     seen, made = _rms(y), _rms(p)
     if max(seen, made) < MIN_MOTION:

@@ -116,8 +116,7 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.camera is not None and (radius := robot.camera.keys.target.radius) is not None:
         size, height = 2.0 * robot.pinhole.focal * radius / model.distance, robot.pinhole.height
         if size > MAX_SIZE * height:
-            takes = f"takes {size:.0f} px of an image {height} px high"
-            remark(f"camera {robot.camera.name}: the ball {takes}; is it its radius?")
+            remark(f"{robot.camera.name}: the ball takes {size:.0f} px of an image {height} px high; is it its radius?")
     return model
 
 

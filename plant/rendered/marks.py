@@ -5,8 +5,9 @@ their mean μ and covariance Σ, the pixels x of a whole ellipse are those with
 
     (x − μ)ᵀ Σ⁻¹ (x − μ) ≤ 4
 
-and a mark that something hides in part, that the border cuts or that touches another mark is not measured. A pixel at
-its edge counts by the share w that the mark has of it: how far its colour c is from grey towards the mark's paint e,
+and a mark that something hides in part, that the border cuts or that touches another mark is not measured. A notch in a
+ball, such as that of its stick, is filled up to the convex hull. A pixel at the edge counts by the share w that is the
+mark's: how far its colour c is from grey towards the mark's paint e,
 
     a = max(0, (c − c̄) · (e − ē)),        w = a / (largest a among its neighbours)
 
@@ -41,8 +42,7 @@ MARK_COLOURS: Final = (
     MarkColour((0.05, 0.75, 0.15, 1.0), ((46, 120, 40), (65, 255, 255))),  # green
     MarkColour((0.85, 0.05, 0.80, 1.0), ((139, 120, 40), (157, 255, 255))),  # magenta
 )
-EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse,
-BALL_EDGE = 0.12  # or that of a ball as a share of its half axes: its stick hides a part of the rim that grows with it
+EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse
 MIN_HALF_AXIS = 1.5  # [px] of the ellipse of a mark
 NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 ELLIPSE = 2.0  # standard deviations of a filled ellipse from its middle to its edge
@@ -65,48 +65,58 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | N
     """
     hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
     masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
-    share = BALL_EDGE if len(colours) == 1 else 0.0
     found: list[Mark | None] = []
     for number, mask in enumerate(masks):
-        patch = largest_patch(mask)
-        others = masks[:number] + masks[number + 1 :]
-        if patch is None or not fills_ellipse(patch, share) or _touches(patch, others):
+        patch, others = largest_patch(mask), masks[:number] + masks[number + 1 :]
+        whole = patch if patch is None or others or fills_ellipse(patch) else _hull(patch)
+        if patch is None or whole is None or not fills_ellipse(whole) or _touches(patch, others):
             found.append(None)
         else:
-            found.append(_with_shares(patch, rgb, colours[number].paint))
+            found.append(_with_shares(patch, whole, rgb, colours[number].paint))
     return found
 
 
-def fills_ellipse(patch: Patch, share: float = 0.0) -> bool:
-    """Return whether pixels fill an ellipse and nothing else, to within `EDGE` or a share of its half axes, if more."""
+def _hull(patch: Patch) -> Patch:
+    """Return the pixels of the convex hull of a patch."""
+    corner = np.array([patch.columns.min(), patch.rows.min()])
+    points = (np.stack([patch.columns, patch.rows], axis=-1) - corner).astype(np.int32)
+    box = np.zeros(points.max(axis=0)[::-1] + 1, dtype=np.uint8)
+    rows, columns = np.nonzero(cv2.fillConvexPoly(box, cv2.convexHull(points), 1))
+    return Patch(rows + corner[1], columns + corner[0])
+
+
+def fills_ellipse(patch: Patch) -> bool:
+    """Return whether pixels fill an ellipse and nothing else, to within `EDGE`."""
     x = np.stack([patch.columns, patch.rows], axis=-1).astype(np.float64)
     middle = x.mean(axis=0)
     sizes, axes = np.linalg.eigh(np.cov(x.T, bias=True))
     half = ELLIPSE * np.sqrt(np.maximum(sizes, 0.0))
     if half[0] < MIN_HALF_AXIS:
         return False
-    edge = np.maximum(EDGE, share * half)
     lower = np.array([patch.columns.min(), patch.rows.min()])
     width, height = np.array([patch.columns.max(), patch.rows.max()]) - lower + 1
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + lower
-    inner = (((grid - middle) @ axes / (half - edge).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
-    outer = (((grid - middle) @ axes / (half + edge)) ** 2).sum(axis=-1) <= 1.0
+    inner = (((grid - middle) @ axes / (half - EDGE).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
+    outer = (((grid - middle) @ axes / (half + EDGE)) ** 2).sum(axis=-1) <= 1.0
     filled = np.zeros((height, width), dtype=np.bool_)
     filled[patch.rows - lower[1], patch.columns - lower[0]] = True
     return bool((filled | ~inner).all() and (outer | ~filled).all())
 
 
-def _with_shares(patch: Patch, rgb: ByteArray, paint: Colour) -> Mark:
-    """Return the mark of a patch, with its share of each pixel of the patch and of their neighbours."""
+def _with_shares(patch: Patch, whole: Patch, rgb: ByteArray, paint: Colour) -> Mark:
+    """Return the mark of a patch, with its share of each pixel of the whole mark and of their neighbours."""
     top, left = patch.rows.min() - 1, patch.columns.min() - 1
     box = rgb[top : patch.rows.max() + 2, left : patch.columns.max() + 2, :3].astype(np.float64)
     towards = np.array(paint[:3]) - np.mean(paint[:3])
     amount = np.maximum((box - box.mean(axis=-1, keepdims=True)) @ towards, 0.0)
     near = np.zeros(amount.shape, dtype=np.uint8)
-    near[patch.rows - top, patch.columns - left] = 1
+    near[whole.rows - top, whole.columns - left] = 1
     rows, columns = np.nonzero(cv2.dilate(near, NEIGHBOURS))
-    most = np.asarray(cv2.dilate(amount, NEIGHBOURS))[rows, columns]
-    return Mark(rows + top, columns + left, amount[rows, columns] / np.maximum(most, 1e-9))
+    shares = amount / np.maximum(np.asarray(cv2.dilate(amount, NEIGHBOURS)), 1e-9)
+    inner = cv2.erode(near, NEIGHBOURS)
+    inner[patch.rows - top, patch.columns - left] = 0
+    shares[(cv2.dilate(inner, NEIGHBOURS) & near) > 0] = 1.0
+    return Mark(rows + top, columns + left, shares[rows, columns])
 
 
 def disc_centre(mark: Mark, camera: PinholeCamera) -> FloatArray:

@@ -170,11 +170,10 @@ class OwnCamera:
         keys, changes = self.keys, dict[str, Any]()
         if keys.rate is not None:
             frames, whole = keys.rate * period, max(1, round(1e3 / keys.rate)) / 1e3
-            count, more = round(1.0 / frames), round(frames)
-            if more > 1 and abs(frames / more - 1.0) < ROUNDED:
+            if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
                 whole = 0.0
-            elif count and abs(count * frames - 1.0) < 1e-5:
-                whole = count * period
+            elif abs(round(1.0 / frames) * frames - 1.0) < 1e-5:
+                whole = round(1.0 / frames) * period
             elif abs(round(whole / period) * period - whole) > ROUNDED * period:
                 clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
                 remark(f"camera {self.name}: {clocks}, so delays change; --set run.period={1e3 * whole:g}ms helps")
@@ -308,9 +307,8 @@ def _check(camera: OwnCamera) -> None:
     squares = np.linspace(0.0, math.hypot(*far) ** 2)
     radial, tangential = squares * (k1 + squares * (k2 + squares * k3)), 3.0 * math.hypot(p1, p2) * np.sqrt(squares)
     if (moved := (np.abs(radial) + tangential).max()) > MAX_MOVED:
-        far_away = f"moves points by {moved:.0%} of their distance from the middle"
-        order = f"coefficients of OpenCV are no percent, and in the order {', '.join(COEFFICIENTS)}"
-        remark(f"distortion {list(camera.distortion)} {far_away}; {order}")
+        much = f"moves points by {moved:.0%} of their distance from the middle; coefficients"
+        remark(f"distortion {list(camera.distortion)} {much} of OpenCV are no percent, and k1, k2, p1, p2, k3")
     if camera.second is not None:
         pair = [(each.width, each.height, each.pose.frame) for each in (keys, camera.second.keys)]
         if pair[0] != pair[1]:

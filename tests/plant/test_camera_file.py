@@ -207,7 +207,7 @@ def test_a_bad_file_is_one_line(write, old, new, said):
         (
             "p1 = 0.002",
             "p1 = 0.9",
-            "of their distance from the middle; coefficients of OpenCV are no percent, and in the",
+            "of their distance from the middle; coefficients of OpenCV are no percent, and k1, k2, p1",
         ),
         (
             "[0.0, 0.0, 0.70710678, 0.70710678]",
