@@ -87,7 +87,7 @@ def figures(
     kind: Annotated[str, option("NAMES", "Comma-separated kinds, such as errors,paths; default: all of them.")] = "all",
     controllers: Annotated[str, option("NAMES", "Comma-separated names; default: all of the folder.")] = "all",
     names: Annotated[str, option("NAMES", "Comma-separated names in the figures, in the order of --controllers.")] = "",
-    width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 3.5in, 89mm or 252pt.")] = "7.2in",
+    width: Annotated[str, option("LENGTH", "Width of a column of a paper, such as 252pt, 89mm or 3.5in.")] = "7.2in",
     title: Annotated[bool, switch("--title/--no-title", "Write a title above each figure.")] = True,
     format_: Annotated[
         str, named_option("--format", "NAMES", "Comma-separated: pdf, svg, png, pgf (needs a TeX while it is drawn).")

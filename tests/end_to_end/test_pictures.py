@@ -295,6 +295,16 @@ def test_every_figure_of_the_report_fits_a_column_of_a_paper(monkeypatch, tmp_pa
         assert b"/Type3" not in content
 
 
+@pytest.mark.parametrize("width", [252.0, 516.0])
+def test_a_figure_is_as_wide_as_a_column_of_ieeetran_or_both(tmp_path, width):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
+    choice = Choice(("errors",), {"ukf_mfac": "Mine"}, Layout.of_width(f"{width:g}pt"), title=False)
+    (named,) = folder_figures(folder, choice)
+    (path,) = style.save_figure(named.figure, tmp_path / "errors", ("pdf",), exact_width=True)
+    points = float(re.search(rb"/MediaBox \[ ?0 0 (\S+) ", path.read_bytes())[1])
+    assert 72.27 / 72.0 * points == pytest.approx(width, abs=1e-3)
+
+
 def test_figures_show_the_chosen_controllers_by_their_new_names_in_their_usual_style(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "mine", "rls"))
     choice = Choice(("errors",), {"rls": "UKF+MFAC", "ukf_mfac": "Mine"}, Layout.of_width("89mm"), title=False)
