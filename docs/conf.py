@@ -49,6 +49,7 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 ACCENT = re.compile(r"(\\(?:bar|dot|hat|tilde)\{[^{}]*\})_")  # docutils would set the index below the accented letter
 FENCE = re.compile("<mo[^>]*>([‖⟨⟩|])</mo>")  # which a browser would stretch to the height of the row
+SHORT = 24  # letters of code that is not broken
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+\.md)(?:#[^)\s]*)?\)")  # files beside the code
 
 
@@ -56,6 +57,7 @@ def setup(app: Sphinx) -> None:
     """Make links to Markdown files outside this folder downloads, as those to code are; set equations and drawings."""
     app.connect("source-read", link_files)
     app.connect("doctree-resolved", inline_drawings)
+    app.connect("doctree-resolved", keep_together)
     app.add_source_suffix(".ipynb", "notebook")
     app.add_source_parser(NotebookParser)
     app.add_html_math_renderer("mathml", (write_formula, None), (write_formula, None))
@@ -101,6 +103,14 @@ def inline_drawings(app: Sphinx, page: nodes.document, _name: str) -> None:
         if image["uri"].endswith(".svg"):
             drawing = (Path(app.srcdir) / image["uri"]).read_text(encoding="utf-8")
             image.replace_self(nodes.raw("", f'<div class="drawing">{drawing}</div>', format="html"))
+
+
+def keep_together(_app: Sphinx, page: nodes.document, _name: str) -> None:
+    """Keep options and other short code on one line, and each number of a table on that of its percent sign."""
+    for code in page.findall(nodes.literal):
+        code["classes"] += ["short"] if len(code.astext()) <= SHORT else []
+    for text in [text for cell in page.findall(nodes.entry) for text in cell.findall(nodes.Text)]:
+        text.parent.replace(text, nodes.Text(text.replace(" %", "\u00a0%")))
 
 
 def link_files(app: Sphinx, name: str, source: list[str]) -> None:
