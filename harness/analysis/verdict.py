@@ -35,7 +35,7 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
-NOBODY: Final = "nobody"
+NO_RIVAL: Final = "none"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
 NAMED, MANY = 3, 6  # controllers that a sentence names at most
 MOST_PLACES: Final = 24  # for which leaders are named
@@ -274,7 +274,7 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
         ("First", "median"): median(first),
         ("Next", "controller"): second,
         ("Next", "median"): median(second),
-        ("How sure", RIVALS): _listed(rivals, NAMED).replace("`", "") if rivals else NOBODY,
+        ("How sure", RIVALS): _listed(rivals, NAMED).replace("`", "") if rivals else NO_RIVAL,
     }
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from kit.command import judged, servobench, start
+from kit.command import judged, servobench
 from kit.plants import NEEDS_BULLET
 
 
@@ -64,20 +64,6 @@ def test_a_run_without_figures_leaves_its_tables_only(monkeypatch, tmp_path, cap
     assert sorted(path.name for path in out.iterdir()) == [
         "SHA256SUMS", "manifest.json", "runs.parquet", "steps.parquet",
     ]  # fmt: skip
-
-
-@pytest.mark.skipif(os.name != "posix", reason="a pipe of POSIX")
-def test_a_run_whose_output_is_not_read_to_its_end_leaves_everything(tmp_path):
-    process = start(
-        "run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out")
-    )
-    with process, process.stdout, process.stderr:
-        process.stdout.close()
-        errors = process.stderr.read()
-    assert process.returncode == 0, errors
-    assert "Traceback" not in errors
-    assert "BrokenPipe" not in errors
-    assert len(list((tmp_path / "out" / "figures").iterdir())) > 3
 
 
 def test_a_command_that_is_started_with_interrupts_ignored_can_be_interrupted(monkeypatch):
