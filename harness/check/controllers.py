@@ -2,9 +2,8 @@
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
@@ -14,7 +13,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.methods import with_aids
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
-from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, attributes, differing, watching_draws
+from servobench.harness.check.rig import PERIOD, PREVIEW, Conditions, Driver, Rig, attributes, differing, watching_draws
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
 from servobench.harness.config.source import describe_at
@@ -57,7 +56,7 @@ def check_controller(
     """
     with offering():
         name = choose_controller(controller)
-        return report(name, ControllerChecks(find_controller(name)).carry_out(begin), found)
+        return report(name, findings_of(ControllerChecks(find_controller(name)).checks(), begin), found)
 
 
 class ControllerChecks:
@@ -68,10 +67,6 @@ class ControllerChecks:
         self.entry, self.steps = entry, STEPS
         self._times: list[float] = []
         self._printed = ""
-
-    def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
-        """Yield the finding of each check."""
-        return findings_of(self.checks(), begin)
 
     def checks(self) -> list[Check]:
         """Return the checks in their order."""
@@ -302,11 +297,9 @@ class ControllerChecks:
                 raise CheckFailed(f"two runs that advance together have other commands than each alone; {IN_LANES}")
         return None
 
-    def _build(self, preview: int | None = None) -> tuple[Controller, Rig]:
+    def _build(self, preview: int = PREVIEW) -> tuple[Controller, Rig]:
         rig = Rig(JOINTS, FEATURES)
-        knowledge = rig.knowledge(truth=self.entry.needs_truth)
-        if preview is not None:
-            knowledge = replace(knowledge, preview=preview)
+        knowledge = rig.knowledge(truth=self.entry.needs_truth, preview=preview)
         return self.entry.build(default_config(self.entry), knowledge), rig
 
     def _driver(self, seed: int = 0, **conditions: Any) -> Driver:  # noqa: ANN401 - those of `Conditions`

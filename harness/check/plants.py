@@ -56,7 +56,7 @@ class PlantChecks:
         """Prepare the checks."""
         self.entry, self._plant = entry, list[Plant]()
 
-    def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
+    def carry_out(self, begin: Callable[[str], None]) -> Iterator[Finding]:
         """Yield the finding of each check; the plant is closed at the end."""
         try:
             yield from findings_of(self.checks(), begin)
