@@ -118,24 +118,19 @@ def _check_writable(folder: Path) -> None:
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
-    """Return the run of a folder that is named, or carry out a new one."""
-    if folder is not None:
-        if given := new.given():
-            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
-        return _run_of(folder, run_id)
-    if run_id is not None:
-        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-    return _carried_out(new)
-
-
-def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
-    """Return a run of a results folder; without a name the only one."""
+    """Return the run of a folder that is named, or its only one, or carry out a new one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logs import find_run
     from servobench.harness.pictures.replay import logged_run
 
-    row = find_run(folder, run_id)
-    return logged_run(row, results.load_steps(folder, [row["run_id"]]))
+    if folder is not None:
+        if given := new.given():
+            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+        row = find_run(folder, run_id)
+        return logged_run(row, results.load_steps(folder, [row["run_id"]]))
+    if run_id is not None:
+        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+    return _carried_out(new)
 
 
 def _carried_out(new: NewRun) -> LoggedRun:

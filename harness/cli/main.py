@@ -75,7 +75,7 @@ def _hide_types(root: Any) -> None:  # noqa: ANN401 - typer's own classes have n
         each.help = escape(each.help or "")
         if each.param_type_name == "argument":
             each.metavar = each.metavar or each.name.upper()
-            each.display_type_rich = _no_type
+            each.display_type_rich = lambda ctx: None  # the help of an argument says enough
         elif each.is_flag:
             each.metavar = ""
     for subcommand in getattr(root, "commands", {}).values():
@@ -108,13 +108,11 @@ def in_known_number(root: Any, words: list[str]) -> list[str]:  # noqa: ANN401 -
     return words
 
 
-def _no_type(ctx: object) -> None:
-    """Return no type: the help of an argument says enough."""
-
-
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
-    _say_where_a_signal_strikes()
+    if sys.__stderr__ is not None:
+        with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
+            faulthandler.enable(sys.__stderr__)  # a segmentation fault, as of a plug-in, prints the line that it was in
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as below `&` of a script and in some CI
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(os, "fork"):
@@ -149,13 +147,6 @@ def _resuming() -> str:
     called = command_line().commands.get("".join(sys.argv[1:2]))
     kept = called is not None and any(option.name == "resume" for option in called.params)
     return "; finished runs are kept, --resume continues" if kept else ""
-
-
-def _say_where_a_signal_strikes() -> None:
-    """Let a process that ends by a segmentation fault, as of a plug-in, print the line that it was in."""
-    if sys.__stderr__ is not None:
-        with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
-            faulthandler.enable(sys.__stderr__)
 
 
 def _end(line: str) -> NoReturn:

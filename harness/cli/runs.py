@@ -70,11 +70,15 @@ def run(
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.plan import Batch, check_seeds
+    from servobench.harness.config.registry import default_plant
     from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
-    plant = _default_plant() if plant is None else plant
+    if plant is None:
+        plant, why = default_plant()
+        if why:
+            say(f"no plant is named, so this run is on {plant}: {why}")
     plant = selection.choose("plants", plant)
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
@@ -85,16 +89,6 @@ def run(
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=True)
-
-
-def _default_plant() -> str:
-    """Return the first of bullet, mujoco and kinematic that is installed, with a line if it is a second choice."""
-    from servobench.harness.config.registry import default_plant
-
-    name, why = default_plant()
-    if why:
-        say(f"no plant is named, so this run is on {name}: {why}")
-    return name
 
 
 def compare(
@@ -189,7 +183,13 @@ def _show(folder: Path, *, latest: bool, with_figures: bool, with_report: bool) 
     print_faults(folder, runs)
     if latest:
         point_latest(folder)
-    say(f"tables and {_draw(folder)} figures in {folder}" if with_figures else f"tables in {folder}")
+    if with_figures:
+        from servobench.harness.pictures.figures import draw_figures
+
+        with console.status("drawing the figures"):
+            figures = draw_figures(folder)
+            results.vouch(folder, figures)
+    say(f"tables and {len(figures)} figures in {folder}" if with_figures else f"tables in {folder}")
     if with_report:
         try:
             make_report(folder)
@@ -197,14 +197,3 @@ def _show(folder: Path, *, latest: bool, with_figures: bool, with_report: bool) 
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
             say(f"no report: {missing or error}")
     return runs
-
-
-def _draw(folder: Path) -> int:
-    """Draw the figures of a folder and return their number."""
-    from servobench.harness.batch import results
-    from servobench.harness.pictures.figures import draw_figures
-
-    with console.status("drawing the figures"):
-        figures = draw_figures(folder)
-        results.vouch(folder, figures)
-    return len(figures)
