@@ -188,15 +188,11 @@ def show(path: Path) -> str:
 def is_place(text: str) -> bool:
     """Return whether a text says where code stands, and is no name; of a module, whether there is such a one."""
     found = PLACE.fullmatch(text)
-    if found is None:
-        return False
-    return found["file"] is not None or _can_import(found["module"])
-
-
-def _can_import(module: str) -> bool:
+    if found is None or found["file"] is not None:
+        return found is not None
     make_importable(Path.cwd())
     try:
-        return importlib.util.find_spec(module.partition(".")[0]) is not None
+        return importlib.util.find_spec(found["module"].partition(".")[0]) is not None
     except (ImportError, ValueError):
         return False
 

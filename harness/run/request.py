@@ -290,7 +290,8 @@ def find_sensing(word: str) -> Sensing:
 
 @lru_cache(maxsize=64)
 def _find(word: str, file: SourceFile | None) -> Sensing:
-    place, found = _place(word)
+    place = sensing_place(word)
+    found = PLACE.fullmatch(place)
     own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
     with configuration_errors():
         return Sensing.parse(word, {**SETUPS, **own})
@@ -298,7 +299,7 @@ def _find(word: str, file: SourceFile | None) -> Sensing:
 
 def sensing_file(word: str) -> SourceFile | None:
     """Return the file of a user's own set-up; None for one of this package."""
-    _, found = _place(word)
+    found = PLACE.fullmatch(sensing_place(word))
     return SourceFile.read(found["file"]) if found is not None and found["file"] else None
 
 
@@ -306,12 +307,6 @@ def sensing_place(word: str) -> str:
     """Return a word without its mount."""
     place, _, mount = word.rpartition(":")
     return place if mount in (FIXED, HAND) else word
-
-
-def _place(word: str) -> tuple[str, re.Match[str] | None]:
-    """Return a word without its mount, and the file and the name in it where it is those of a user."""
-    place = sensing_place(word)
-    return place, PLACE.fullmatch(place)
 
 
 def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
