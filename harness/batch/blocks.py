@@ -91,10 +91,6 @@ class Block:
         """Index of the first run."""
         return self.jobs[0].index
 
-    def singly(self) -> list[Self]:
-        """Return each run as a block of its own."""
-        return [replace(self, jobs=(job,), together=False) for job in self.jobs]
-
     def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Self:
         """Return some of the runs as a block."""
         return replace(self, jobs=self.jobs[begin:end], fresh=fresh)
@@ -182,9 +178,10 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
         end = End(Ending(CRASHED, reason), certain=False)
     if end is None or len(done) == len(block.jobs):
         return done, []
+    single = replace(block, together=False)
     if not done and len(block.jobs) > 1 and block.together:
-        return [], block.singly()
-    single, at = replace(block, together=False), len(done)
+        return [], [single.part(at, at + 1) for at in range(len(block.jobs))]
+    at = len(done)
     rest = [single.part(at + 1)] if at + 1 < len(block.jobs) else []
     if not end.certain and not block.fresh:  # a fresh block is one run, and its own second attempt
         return done, [single.part(at, at + 1, fresh=True), *rest]

@@ -111,7 +111,10 @@ def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool],
     """Call a function in this process."""
     function, arguments, quiet = argument
     if quiet:
-        _print_nowhere()
+        nothing = Path(os.devnull).open("w")  # noqa: SIM115 - open as long as the process lives
+        for descriptor in OUTPUTS:
+            os.dup2(nothing.fileno(), descriptor)
+        sys.stdout = sys.stderr = nothing
     tell(None)  # its time begins
     try:
         tell(["answer", function(lambda told: tell(["told", told]), *arguments)])
@@ -278,11 +281,3 @@ def _build_plant(name: str, robot_name: str) -> None:
 
 def _stop(_share: float, _what: str) -> None:
     raise _Trains
-
-
-def _print_nowhere() -> None:
-    """Discard the output of code of a user here: where it is wanted, it is printed a second time."""
-    nothing = Path(os.devnull).open("w")  # noqa: SIM115 - open as long as the process lives
-    for descriptor in OUTPUTS:
-        os.dup2(nothing.fileno(), descriptor)
-    sys.stdout = sys.stderr = nothing
