@@ -136,7 +136,9 @@ def compare(
     chosen = _seeds(seeds)
     _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
                  seeds=chosen)  # fmt: skip
-    _check_limits(workers=workers, run_timeout=run_timeout, run_memory=run_memory)
+    for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
@@ -156,13 +158,6 @@ def _seeds(given: object) -> Sequence[int]:
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {given!r}")
     return tuple(read_seed(each) for each in given)
-
-
-def _check_limits(**given: object) -> None:
-    """Raise a `ConfigurationError` if one of the arguments is no positive number; None is no limit."""
-    for name, value in given.items():
-        if value is not None and not (isinstance(value, int | float) and value > 0):
-            raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
 
 
 def _check_lists(**given: object) -> None:

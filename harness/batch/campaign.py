@@ -165,7 +165,10 @@ def _carry_out_at(
         if how.resume and not resumed:
             how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
-            prepare_folder(folder, manifest, how.observer)
+            restored = restore_manifest(folder, manifest)
+            check_same_batch(folder, manifest, how.observer.note, remedy="name another folder with --out")
+            for line in [restored] * bool(restored) + list(mend(folder, manifest)):  # before anything is computed
+                how.observer.note(f"note: {line}")
         else:
             results.create_folder(folder, manifest)
         if not resumed or not results.is_whole(folder, runs.count):
@@ -201,18 +204,6 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
         else:
             build_once(job.run, observer.training)
     return sections
-
-
-def prepare_folder(folder: Path, manifest: dict[str, Any], observer: Observer) -> None:
-    """Check the folder of a batch that is to go on, and mend it before anything is computed.
-
-    Raises:
-        ConfigurationError: not a results folder, or one of other runs or settings.
-    """
-    restored = restore_manifest(folder, manifest)
-    check_same_batch(folder, manifest, observer.note, remedy="name another folder with --out")
-    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
-        observer.note(f"note: {line}")
 
 
 def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[str], None], remedy: str) -> None:

@@ -193,7 +193,10 @@ class Sandbox:
                     end = json.loads(content)
                     return Answer(answer.items, End(Ending(**end["ending"]), end["certain"]))
                 if kind == ITEM:
-                    (hear or answer.items.append)(_read(content))
+                    item = None  # the answer where it is no JSON
+                    with contextlib.suppress(ValueError, RecursionError):
+                        item = json.loads(content)
+                    (hear or answer.items.append)(item)
         except (EOFError, OSError):
             silence = Ending(CRASHED, LOST)
         self.end(0.0)  # it is gone or of no use, and nothing may wait for it when this process ends
@@ -271,14 +274,6 @@ class Sandbox:
             "the worker processes cannot be started; a script that starts some must keep its calls below "
             "`if __name__ == '__main__':`"
         )
-
-
-def _read(content: bytes) -> Any:  # noqa: ANN401 - JSON
-    """Return an answer; None if it is no JSON."""
-    try:
-        return json.loads(content)
-    except (ValueError, RecursionError):
-        return None
 
 
 @contextlib.contextmanager

@@ -292,7 +292,9 @@ def check_settings(config: Callable[[], Any], place: str) -> None:
     if not callable(config):
         raise ConfigurationError(f"{place}: config must be a dataclass or a function, got {config!r}")
     where, name = (_class_place(config), config.__name__) if isinstance(config, type) else (place, "config")
-    needed = _without_default(config)
+    known = fields(config) if isinstance(config, type) and is_dataclass(config) else ()
+    needed = [each.name for each in known
+              if each.init and each.default is MISSING and each.default_factory is MISSING]  # fmt: skip
     if needed:
         raise ConfigurationError(f"{where}: every field of {name} needs a default; {', '.join(needed)} has none")
     try:
@@ -302,13 +304,6 @@ def check_settings(config: Callable[[], Any], place: str) -> None:
     if isinstance(made, type) or not is_dataclass(made):
         remedy = f"put @dataclass(frozen=True) above class {name}" if isinstance(config, type) else "return a dataclass"
         raise ConfigurationError(f"{where}: the settings {name} are no dataclass; {remedy}")
-
-
-def _without_default(config: object) -> list[str]:
-    if not (isinstance(config, type) and is_dataclass(config)):
-        return []
-    return [each.name for each in fields(config)
-            if each.init and each.default is MISSING and each.default_factory is MISSING]  # fmt: skip
 
 
 def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
