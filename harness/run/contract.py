@@ -26,9 +26,8 @@ MAX_NAMES, MAX_LETTERS = 256, 100  # of diagnostics in a run, each of which is a
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
     """Return plant and controller such that each raises `WrongAnswer` where it breaks its contract."""
-    kept = isinstance(plant, Bench), isinstance(controller, ServoController)
-    spec = plant.spec
-    return plant if kept[0] else HeldPlant(plant), controller if kept[1] else HeldController(controller, spec)
+    held = controller if isinstance(controller, ServoController) else HeldController(controller, plant.spec)
+    return plant if isinstance(plant, Bench) else HeldPlant(plant), held
 
 
 @final

@@ -32,7 +32,7 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting
 from servobench.harness.run.tasks import TASKS, find_task
-from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
+from servobench.plant.bench.plant import Plant, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.cameras.setups import SetupModel
@@ -249,7 +249,9 @@ def _assemble(
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
         raise ConfigurationError(f"plant {entry.name} has the sensing position only, got --sensing {request.sensing}")
     robot = None if entry.own_robot else find_robot(request.robot)
-    plant = _build_plant(resolved, entry, PlantSetup(true, start, run.period, robot))
+    setup = PlantSetup(true, start, run.period, robot)
+    with configuration_errors(f"plant {request.plant}: ", RunFault):
+        plant = entry.build(resolved.plant, setup)
     try:
         if robot is None:
             knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
@@ -350,11 +352,6 @@ def _equations(model: RobotModel | None) -> TrueModel:
         return symbolic_feature(model)(joint_position)
 
     return TrueModel(TrueJacobian(model), symbolic)
-
-
-def _build_plant(resolved: ResolvedRun, entry: PlantEntry, setup: PlantSetup) -> Plant:
-    with configuration_errors(f"plant {resolved.request.plant}: ", RunFault):
-        return entry.build(resolved.plant, setup)
 
 
 def _build_controller(

@@ -125,7 +125,8 @@ class Task(ABC):
             work: the workspace of the robot.
         """
         del name
-        points = {each: enlarged(work, getattr(self, each)) for each in self.places if each != "start"}
+        given = {each: getattr(self, each) for each in self.places if each != "start"}
+        points = {each: tuple(work.scale * value for value in point) for each, point in given.items()}
         home = {"start": numbers(work.home)} if "start" in self.places else {}
         return replace(self, **points, **home)  # type: ignore[type-var]
 
@@ -143,8 +144,3 @@ class TaskEntry:
 def numbers(values: FloatArray) -> Vector:
     """Return joint positions as a setting."""
     return tuple(np.asarray(values, dtype=np.float64).tolist())
-
-
-def enlarged(work: Workspace, point: Vector) -> Vector:
-    """Return a point of the camera frame [m] in the workspace of another arm."""
-    return tuple(work.scale * value for value in point)
