@@ -4,7 +4,7 @@
 PID, by a Lyapunov update (eqs. 40–44).
 """
 
-from typing import Annotated, NamedTuple, final
+from typing import Annotated, Any, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -84,8 +84,38 @@ class RbfState(NamedTuple):
     step: FloatArray  # α₂ of the last update, (...)
 
 
+class RbfLyapunovState(NamedTuple):
+    """W by rows of the Jacobian, (..., m, n, L), m/rad; and s of the last motion, (..., m), m/s."""
+
+    rows: FloatArray
+    rate_error: FloatArray
+
+
+NetworkState = TypeVar("NetworkState", RbfState, RbfLyapunovState)
+
+
+class NetworkEstimator(Estimator[NetworkState]):
+    """A Jacobian network whose weights are updated online."""
+
+    brings_model = True
+
+    def __init__(self, config: Any, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:  # noqa: ANN401
+        """Take the settings and the offline Jacobian network, from which a run starts."""
+        self._config = config
+        self._network = networks.jacobian
+        self._features = FeatureMemo(self._network)
+
+    def deviation(self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray) -> FloatArray:
+        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
+        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
+
+    def jacobian(self, state: NetworkState, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
+        return self._features.jacobian(state.rows, joint_position)
+
+
 @final
-class RbfEstimator(Estimator[RbfState]):
+class RbfEstimator(NetworkEstimator[RbfState]):
     """Jacobian network with the paper's windowed gradient update.
 
         Ĵ_i(q) = W_i θ_i(q)                                                     (eqs. 29, 30)
@@ -103,13 +133,7 @@ class RbfEstimator(Estimator[RbfState]):
     term more).
     """
 
-    brings_model = True
-
-    def __init__(self, config: RbfConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
-        """Take the settings and the offline Jacobian network, from which a run starts."""
-        self._config = config
-        self._network = networks.jacobian
-        self._features = FeatureMemo(self._network)
+    _config: RbfConfig
 
     def start(self, jacobian: FloatArray) -> RbfState:
         """Start from the offline network; see `started_rows`."""
@@ -150,14 +174,6 @@ class RbfEstimator(Estimator[RbfState]):
         past = theta[..., 1:, :, :], joint_steps[..., 1:, :], feature_steps[..., 1:, :]
         return RbfState(rows, *past, filled, errors, step)
 
-    def deviation(self, state: RbfState, first: RbfState | None, joint_position: FloatArray) -> FloatArray:
-        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
-        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
-
-    def jacobian(self, state: RbfState, joint_position: FloatArray) -> FloatArray:
-        """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
-        return self._features.jacobian(state.rows, joint_position)
-
     def diagnostics(self, state: RbfState) -> Diagnostics:
         """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
         return {
@@ -177,15 +193,8 @@ class RbfLyapunovConfig:
     """[1/m] n₃, weight of the prediction error."""
 
 
-class RbfLyapunovState(NamedTuple):
-    """W by rows of the Jacobian, (..., m, n, L), m/rad; and s of the last motion, (..., m), m/s."""
-
-    rows: FloatArray
-    rate_error: FloatArray
-
-
 @final
-class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
+class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
     """Jacobian network whose update makes V = ½ n₂ eᵀe + ½ Σ‖W̃_i‖² decrease under u = K_p Ĵ⁺ e.
 
         Ĵ_i(q) = W_i θ_i(q)                                            (eqs. 40, 41)
@@ -202,13 +211,7 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
     small: n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
     """
 
-    brings_model = True
-
-    def __init__(self, config: RbfLyapunovConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
-        """Take the settings and the offline Jacobian network, from which a run starts."""
-        self._config = config
-        self._network = networks.jacobian
-        self._features = FeatureMemo(self._network)
+    _config: RbfLyapunovConfig
 
     def start(self, jacobian: FloatArray) -> RbfLyapunovState:
         """Start from the offline network; see `started_rows`."""
@@ -223,16 +226,6 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
         rows = self._network.gradient(pull[..., None, :], dq, theta[..., None, :, :])
         np.add(rows, state.rows, out=rows)
         return RbfLyapunovState(rows, s)
-
-    def deviation(
-        self, state: RbfLyapunovState, first: RbfLyapunovState | None, joint_position: FloatArray
-    ) -> FloatArray:
-        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
-        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
-
-    def jacobian(self, state: RbfLyapunovState, joint_position: FloatArray) -> FloatArray:
-        """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
-        return self._features.jacobian(state.rows, joint_position)
 
     def diagnostics(self, state: RbfLyapunovState) -> Diagnostics:
         """Return ‖s‖, the prediction error of the feature's velocity (m/s), and the norm of all weights."""
