@@ -5,6 +5,7 @@ The checks are those of the archive and the description (by fmpy), and a run aga
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,21 +100,13 @@ def validate_fmu(path: Path) -> Validation:
         if referenced:
             deviation = _deviation(description, root)
         else:
-            _make_ready(description, root)
+            with closing(open_instance(description, root)) as instance:
+                instance.start(0.0)
     except (FmuError, ValueError) as error:
         problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
     if deviation is not None and not deviation <= TOLERANCE:
         problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
     return Validation(tuple(problems), deviation)
-
-
-def _make_ready(description: FmuDescription, root: Path) -> None:
-    """Load the FMU, instantiate and initialise it, and end it again."""
-    instance = open_instance(description, root)
-    try:
-        instance.start(0.0)
-    finally:
-        instance.close()
 
 
 def _deviation(description: FmuDescription, root: Path) -> float:
@@ -123,8 +116,7 @@ def _deviation(description: FmuDescription, root: Path) -> float:
     inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
     if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
         raise ValueError("the reference tables do not fit the FMU's variables")
-    instance = open_instance(description, root)
-    try:
+    with closing(open_instance(description, root)) as instance:
         write, read = instance.writer(inputs), instance.reader(outputs)
         times = commands[:, 0]
         instance.start(float(times[0]))
@@ -136,8 +128,6 @@ def _deviation(description: FmuDescription, root: Path) -> float:
             write()
             if k + 1 < len(times):
                 instance.stepper(float(times[k + 1] - time))(float(time))
-    finally:
-        instance.close()
     size = np.maximum(1.0, np.abs(wanted[:, 1:]))  # pixels of a point beside a camera are large
     return float((np.abs(came - wanted[:, 1:]) / size).max())
 

@@ -160,7 +160,9 @@ def write_description(description: Description, version: int, token: str) -> byt
         root.attrib["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
     _interfaces(root, description, version)
     _units(root, {group.unit for group in description.layout.groups})
-    _log_categories(root)
+    categories = ET.SubElement(root, "LogCategories")
+    for name, text in LOG_CATEGORIES.items():
+        ET.SubElement(categories, "Category", name=name, description=text)
     experiment = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(description.step)}
     ET.SubElement(root, "DefaultExperiment", experiment)
     variables = ET.SubElement(root, "ModelVariables")
@@ -241,12 +243,6 @@ def _units(root: ET.Element, used: set[str]) -> None:
         ET.SubElement(unit, "BaseUnit", exponents)
         if name in DISPLAY_UNITS:
             ET.SubElement(unit, "DisplayUnit", name=DISPLAY_UNITS[name], factor=repr(180 / math.pi))
-
-
-def _log_categories(root: ET.Element) -> None:
-    categories = ET.SubElement(root, "LogCategories")
-    for name, text in LOG_CATEGORIES.items():
-        ET.SubElement(categories, "Category", name=name, description=text)
 
 
 def _scalar_variables(variables: ET.Element, description: Description) -> None:

@@ -2,7 +2,7 @@
 
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -10,7 +10,7 @@ from servobench.fmus.compiler import Platform
 from servobench.fmus.controller_export import COMMAND, FEATURE, POSITION, SEEN
 from servobench.fmus.model_description import UNITS
 from servobench.fmus.product import Product, tool, write_archive
-from servobench.fmus.variables import INPUT, Group
+from servobench.fmus.variables import INPUT
 
 SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
@@ -55,7 +55,10 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
     root = ET.Element(f"{{{SSD}}}SystemStructureDescription", attributes)
     groups = {name: {group.name: group for group in product.description.layout.groups} for name, product in
               products.items()}  # fmt: skip
-    wires = list(_wires(groups[PLANT]))
+    feature = BALL if BALL in groups[PLANT] else FEATURE
+    measured = (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN))
+    wires = [((PLANT, own), (CONTROLLER, wanted)) for own, wanted in measured]
+    wires.append(((CONTROLLER, COMMAND), (PLANT, COMMAND)))
     ends = [(side, groups[side][name]) for start, end in wires for side, name in (start, end)]
     system = ET.SubElement(root, f"{{{SSD}}}System", name="loop")
     elements = ET.SubElement(system, f"{{{SSD}}}Elements")
@@ -78,14 +81,6 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
     ET.SubElement(root, f"{{{SSD}}}DefaultExperiment", startTime="0", stopTime=repr(stop))
     ET.indent(root)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root) + b"\n"
-
-
-def _wires(plant: Mapping[str, Group]) -> Iterator[tuple[tuple[str, str], tuple[str, str]]]:
-    """Yield the start and the end of each connection: side and variable."""
-    feature = BALL if BALL in plant else FEATURE
-    for own, wanted in (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN)):
-        yield (PLANT, own), (CONTROLLER, wanted)
-    yield (CONTROLLER, COMMAND), (PLANT, COMMAND)
 
 
 def _units(root: ET.Element, used: set[str]) -> None:

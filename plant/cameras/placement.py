@@ -59,12 +59,6 @@ class CameraDraws:
         return {f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)}
 
 
-def planned_draws(count: int) -> CameraDraws:
-    """Return the draws of `count` cameras that are as planned."""
-    zero = np.zeros(count)
-    return CameraDraws(np.ones(count), np.zeros((count, 2)), zero, np.zeros((count, 3)), np.zeros((count, 3)))
-
-
 def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
     """Draw the deviations of `count` cameras from the planned ones; `seed` is that of the robot's mismatch."""
     size = mismatch.size
@@ -104,7 +98,8 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
         raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
     if robot.camera is not None:
         _check_fit(robot.camera, setup, mount)
-    draws = planned_draws(setup.cameras)
+    c = setup.cameras
+    draws = CameraDraws(np.ones(c), np.zeros((c, 2)), np.zeros(c), np.zeros((c, 3)), np.zeros((c, 3)))
     model = _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), draws)
     home = robot.workspace.home
     if robot.camera is not None and not (model.distance > NEAR and model.valid_at(model.points(home)).all()):

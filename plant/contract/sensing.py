@@ -191,9 +191,8 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
     families: list[Family] = []
     for name, written, size in axes:
         axis = SENSOR_AXES[name]
-        own: dict[str, Any] = {axis.setting: size}
         check_field(name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size)
-        changes |= own
+        changes[axis.setting] = size
         if axis.family is not None:
             families.append(axis.family)
             changes["noise"] = axis.family

@@ -6,7 +6,7 @@ are set before every run.
 """
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
@@ -136,9 +136,11 @@ class FmuWorld(World):
         self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
         self._split = self.spec.n if mapping.joints else 0
         self._now = ctypes.c_double()
-        setters = {
-            name: (variables[0], setter(variables, name, value, self.lead)) for name, variables, value in self._values()
-        }
+        find = self.description.find
+        given = [(name, find(name, "parameters", None), value) for name, value in mapping.parameters.items()]
+        if mapping.home is not None and self._has_start:
+            given.append((mapping.home, find(mapping.home, "home"), self._start))
+        setters = {name: (variables[0], setter(variables, name, value, self.lead)) for name, variables, value in given}
         sizes_first = sorted(setters.values(), key=lambda pair: pair[0].causality != STRUCTURAL)
         self._setters = [act for _, act in sizes_first]
         self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
@@ -158,14 +160,6 @@ class FmuWorld(World):
 
     def _port(self, role: str, names: Names) -> Port:
         return Port(self.description.select(names, role), self.lead)
-
-    def _values(self) -> Iterator[tuple[str, list[Variable], npt.NDArray[Any]]]:
-        """Yield names, variables and values of the parameters, and of the start where a parameter takes it."""
-        mapping = self._mapping
-        for name, value in mapping.parameters.items():
-            yield name, self.description.find(name, "parameters", None), value
-        if mapping.home is not None and self._has_start:
-            yield mapping.home, self.description.find(mapping.home, "home"), self._start
 
     def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start; nothing here is random."""

@@ -127,17 +127,14 @@ class BulletScene(Scene):
         try:
             self._arm = self._world.load(room.files())
             if window:
-                self._aim_window()
+                # The window shows the arm from the front right, without PyBullet's side panels.
+                client = self._world.client
+                pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+                pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
         except BaseException:
             self.close()
             raise
         self._ball_link = room.arm.n + 1
-
-    def _aim_window(self) -> None:
-        """Show the arm from the front right, without PyBullet's side panels."""
-        client = self._world.client
-        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
-        pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
     def place(self, theta: FloatArray) -> None:
         """See `Scene.place`."""

@@ -265,7 +265,9 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
         _draw_link(link, step, radius[i], aside[i])
         add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    _draw_tool(add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, radius[-1], ball_radius)
+    flange = add_link(robot, FLANGE_LINK, *LIGHT_PART)  # with a plate and the stick that carries the ball
+    draw_cylinder(flange, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius[-1])
+    draw_cylinder(flange, DARK_GREY, (0.0, 0.0, 0.0), arm.tool, 0.25 * ball_radius)
     add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
     draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, BALL_MESH, ball_radius)
     return robot
@@ -325,9 +327,3 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
         draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
     else:
         draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
-
-
-def _draw_tool(link: ET.Element, tool: FloatArray, radius: float, ball_radius: float) -> None:
-    """Draw the flange's plate and the stick that carries the ball."""
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius)
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ball_radius)

@@ -80,14 +80,10 @@ def _read_calibrated(path: Path) -> Robot:
             f"{1e3 * deviation:.0f} mm away"
         )
     sheet = universal_robot(title)
-    return Robot(
+    return replace(
+        sheet,
         name=path.stem,
-        title=sheet.title,
         source=f"{path.name}, held against {sheet.source}",
-        arm=sheet.arm,
-        limits=sheet.limits,
-        links=sheet.links,
-        workspace=sheet.workspace,
         measured=read_calibration(path, sheet.arm.tool),
         note=(
             f"{path.name} is the factory calibration of a {title} (its flange within {1e3 * deviation:.1f} mm of the "

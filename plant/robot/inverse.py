@@ -32,9 +32,7 @@ DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
 SHRINK, GROW = 0.3, 4.0  # factors on the damping after an accepted and after a rejected step
 
 
-def closest_distance(
-    arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike, starts: int = STARTS
-) -> FloatArray:
+def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike) -> FloatArray:
     """Return the distance to which the ball can approach a point.
 
     Args:
@@ -42,13 +40,12 @@ def closest_distance(
         point: (..., 3), in the base frame [m].
         lower: (n,), joint limits [rad].
         upper: (n,) [rad].
-        starts: from how many joint positions the search begins; more of them miss the nearest place less often.
 
     Returns:
         (...) [m]; of a point that can be reached, at most `CLOSE_ENOUGH`.
     """
     target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
-    first = _starts(starts, target.shape[:-1], low, high)
+    first = _starts(STARTS, target.shape[:-1], low, high)
     _, distance = _search(arm, target, first, low, high, lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
     return np.asarray(distance.min(axis=0))
 

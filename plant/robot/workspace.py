@@ -301,7 +301,8 @@ def _at_height(
 def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> FloatArray | None:
     """Return the fit posture with the ball at `point` (3,) m that has the most fit postures around it."""
     q, distance = reach_for(clear.arm, point, postures, clear.lower, clear.upper)
-    q = _within_a_turn(q, clear)
+    turned = (q + np.pi) % (2 * np.pi) - np.pi
+    q = np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)  # within ±π where the stops allow it
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
@@ -309,12 +310,6 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     shares = [_find_box(clear, home)[0] for home in fit[order]]
     home: FloatArray = fit[order[int(np.argmax(shares))]]
     return home
-
-
-def _within_a_turn(q: FloatArray, clear: Clearance) -> FloatArray:
-    """Return the same postures with joints within ±π where their stops allow it."""
-    turned = (q + np.pi) % (2 * np.pi) - np.pi
-    return np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)
 
 
 def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
