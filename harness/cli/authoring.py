@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import keyword
 import re
 import sys
@@ -45,6 +44,8 @@ def new(
     aids: Annotated[bool, named_option("--aids", "", "A controller with the aids of the bench's methods.")] = False,
 ) -> None:
     """Write a commented controller or plant, and its test."""
+    from importlib.metadata import packages_distributions
+
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
         raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
@@ -59,7 +60,7 @@ def new(
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
-    if module in sys.stdlib_module_names or module in importlib.metadata.packages_distributions():
+    if module in sys.stdlib_module_names or module in packages_distributions():
         raise ConfigurationError(
             f"a Python package is called {module}, which a file of this name would hide; take another"
         )

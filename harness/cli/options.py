@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, get_type_hi
 
 import typer
 
-from servobench.harness.batch.processes import Bounds, read_size
 from servobench.harness.cli import selection
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.plan import Batch
+    from servobench.harness.batch.processes import Bounds
     from servobench.harness.config.settings import Settings
 
 ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
@@ -281,6 +281,8 @@ class Limited:
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
+        from servobench.harness.batch.processes import Bounds, read_size
+
         with configuration_errors("--run-memory: "):
             memory = None if self.run_memory is None else read_size(self.run_memory)
         return Bounds(self.run_timeout, memory, self.isolate)

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import threading
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -63,6 +62,8 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: it cannot be read, or is not valid TOML.
     """
+    import tomllib  # noqa: PLC0415 - help pages are printed without it
+
     text = read_text(kind, path)
     with configuration_errors(f"{kind} {path} is not valid TOML: ", RecursionError):
         return tomllib.loads(text)
