@@ -319,10 +319,12 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
             pass
         case _:
             raise ValueError("it is not the result of a run")
-    known, own = _failed(cell, Ending()).row, {**cell.request.as_row(), **cell.columns}
+    identity = episode.identity(cell.request)
+    known = _with_columns(cell, RunResult.failed(identity, Ending())).row
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
-    if any(json.dumps(row[name]) != json.dumps(value) for name, value in own.items() if name != "robot"):
+    own = (identity.keys() | cell.columns.keys()) - {"robot", "engine"}
+    if any(_differ(known[name], row[name]) for name in own):
         raise ValueError("it is that of another run")
     for name, value in row.items():
         usual = str if name in TEXTS else float
@@ -331,14 +333,19 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
             raise ValueError(  # noqa: TRY004 - the data are wrong, not the call
                 f"its {name} is {str(value)[:60]!r}, wanted a value of type {kinds[0].__name__}"
             )
-        if isinstance(value, int | float) and name in MOST and (value < 0 or value > MOST[name]):
+        if name in MOST and isinstance(value, (int, float)) and (value < 0 or value > MOST[name]):
             raise ValueError(f"its {name} is {value:g}")
-    if wrong := unfit_names(row):
+    if wrong := unfit_names(tuple(row)):
         raise ValueError(f"it {wrong}")
     image = _unpack_array(picture)
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
     return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
+
+
+def _differ(wanted: object, came: object) -> bool:
+    """Return whether two JSON values differ, NaN being equal to itself and 1 unlike 1.0 and true."""
+    return came != wanted if isinstance(wanted, str) else json.dumps(came) != json.dumps(wanted)
 
 
 def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:
@@ -348,7 +355,7 @@ def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:
         raise ValueError("its steps are no numbers")
     table = pd.DataFrame.from_records(records)
     table.insert(0, RUN_ID, run_id)
-    if wrong := unfit_names(table.columns) or lacking("steps", pa.Schema.from_pandas(table)):
+    if wrong := unfit_names(tuple(table.columns)) or lacking("steps", pa.Schema.from_pandas(table)):
         raise ValueError(f"its table of steps {wrong}")
     if not table["time_s"].between(0.0, MAX_TIME).all():
         raise ValueError("its steps have no times")

@@ -5,6 +5,7 @@ import errno
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -182,14 +183,15 @@ def opened(folder: Path, name: str) -> Iterator[pq.ParquetFile]:
     """
     with reading(folder, name), pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
         names, cells = file.schema_arrow.names, file.metadata.num_rows * file.metadata.num_columns
-        if wrong := unfit_names(names):
+        if wrong := unfit_names(tuple(names)):
             raise DamagedFile(folder, name, wrong)
         if cells > max(MAX_CELLS, MAX_CELLS_A_BYTE * (folder / name).stat().st_size):
             raise DamagedFile(folder, name, f"is a bomb: it unpacks to {cells:.2g} cells")
         yield file
 
 
-def unfit_names(names: Collection[str]) -> str:
+@lru_cache(8)  # the rows of a batch have the same names
+def unfit_names(names: tuple[str, ...]) -> str:
     """Return why names cannot be those of columns, as a predicate of the table; empty if they can."""
     if len(names) > MAX_COLUMNS:
         return f"has {len(names)} columns; a table has at most {MAX_COLUMNS}"
