@@ -113,21 +113,23 @@ def paired_difference(first: ArrayLike, second: ArrayLike, margin: float) -> Dif
 
 def is_majority(ones: int, others: int) -> bool:
     """Return whether a one-sided sign test at 5 % shows `ones` to be more frequent; of few, nothing is shown."""
+    if ones + others < MIN_PAIRS:
+        return False
     from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
 
     with np.errstate(under="ignore"):
-        return ones + others >= MIN_PAIRS and stats.binomtest(ones, ones + others, alternative="greater").pvalue < ALPHA
+        return bool(stats.binomtest(ones, ones + others, alternative="greater").pvalue < ALPHA)
 
 
 def mean_with_interval(values: FloatArray) -> Estimate:
     """Return the mean of finite values with Student's interval of 90 %; none of fewer than two values."""
-    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
+    from scipy.special import stdtrit  # noqa: PLC0415 - to judge alone
 
     count = len(values)
     if count < 2:
         return Estimate(float(values.sum()), np.nan, np.nan, count) if count else NO_ESTIMATE
     mean, error = float(values.mean()), float(values.std(ddof=1)) / count**0.5
-    reach = float(stats.t.ppf(1.0 - ALPHA, count - 1)) * error
+    reach = float(stdtrit(count - 1, 1.0 - ALPHA)) * error
     return Estimate(mean, mean - reach, mean + reach, count)
 
 
@@ -155,8 +157,6 @@ def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "lef
     Raises:
         ValueError: no value, or −∞.
     """
-    from scipy import stats  # noqa: PLC0415 - as above
-
     given = np.asarray(values, dtype=np.float64).ravel()
     sample = _sample(given[~np.isnan(given)] if missing == "left_out" else given)
     if len(sample) == 0:
@@ -173,6 +173,8 @@ def median_with_interval(values: ArrayLike, *, missing: Literal["infinite", "lef
     value = float(restored(np.median(sample, keepdims=True))[0])
     if len(sample) == 1:
         return Estimate(value, np.nan, np.nan, 1)
+    from scipy import stats  # noqa: PLC0415 - as above
+
     with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
         drawn = stats.bootstrap(
             (sample,), np.median, n_resamples=RESAMPLES, batch=max(1, DRAWN_AT_ONCE // len(sample)),

@@ -356,7 +356,8 @@ def drawing_of(figure: Figure, layout: Layout = WIDE) -> Drawing:
     large, small = io.BytesIO(), io.BytesIO()
     with figure_style(TEXT):
         box = box_of(figure)
-        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
+        unpacked = {"compress_level": 0}  # it is read again at once
+        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box, pil_kwargs=unpacked)
     # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:
         indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
