@@ -1,4 +1,4 @@
-"""The limit of `kinematic` with `ukf_mfac`: the bare arithmetic of its period, in C and in numpy for many runs."""
+"""The limit of `kinematic` with `ukf_mfac:published`: its bare arithmetic, in C and in numpy for many runs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def bare_c(runs: int) -> float:
 
 def block(runs: int) -> float:
     """Return the same for the package, with building and judging."""
-    resolved = resolved_runs("kinematic", "ukf_mfac", runs)
+    resolved = resolved_runs("kinematic", "ukf_mfac:published", runs)
     began = time.process_time()
     carry_out_together(resolved)
     return (time.process_time() - began) / runs / PERIODS
@@ -83,7 +83,7 @@ def main() -> None:
         f"the package, a block of {runs}": min(block(runs) for _ in range(rounds + 1)),
     }
     rows = [[name, f"{microseconds(cost)} µs", f"{cost / limit:.1f}"] for name, cost in costs.items()]
-    print(table(["bare arithmetic of `kinematic` with `ukf_mfac`", "a period", "× C"], rows))
+    print(table(["bare arithmetic of `kinematic` with `ukf_mfac:published`", "a period", "× C"], rows))
 
 
 if __name__ == "__main__":
