@@ -334,7 +334,7 @@ def command_response(log: Log) -> Response | None:
     def errors(times: FloatArray) -> FloatArray:
         return (steps - joint_steps(u, spec.period, *times))[first:].ravel()
 
-    starts = [(delay, lag) for delay in np.arange(0.0, 0.2, 0.5 * spec.period) for lag in (0.02, 0.1)]
+    starts = [(delay, lag) for delay in np.arange(0.0, 0.2, 0.1 * spec.period) for lag in (0.01, 0.03, 0.1)]
     best = min(starts, key=lambda each: float(np.sum(errors(np.array(each)) ** 2)))
     solved: Any = least_squares(
         errors, best, bounds=((0.0, 1e-4), (MAX_LAG, MAX_LAG)), x_scale=0.01, diff_step=[1e-4, 1e-4]
