@@ -20,6 +20,7 @@ the motions that the delay pairs then gives the Jacobian.
 """
 
 import math
+from collections.abc import Iterable
 from typing import Final, NamedTuple, Self, cast, final
 
 import numpy as np
@@ -55,12 +56,17 @@ MAP_WALK: Final = 0.1  # [1/√m] w, of an entry of M
 REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
 MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
-LAST_THREE = np.array([0, 1, 2])
+MAP_DEVIATION: Final = 0.55  # [1] of an entry of M at first; larger ones favour late delays while an arm speeds up
 
 
 @final
 class Candidates:
-    """Candidate delays and rows of the past at them; between two rows the motion is interpolated linearly.
+    """Candidate delays and rows of the past at them; between rows the motion is interpolated.
+
+    At a share c of a period before row w, with the second difference of the motion at its earlier end, because the
+    joints lag behind their commands and never change their speed at once:
+
+        x = (1 − c) x_w + c x_{w+1} − ½ c (1 − c) (x_w − 2 x_{w+1} + x_{w+2})
 
     Attributes:
         delays: (D,), periods.
@@ -74,8 +80,10 @@ class Candidates:
         self.beside = np.abs(np.arange(len(delays)) - 1) % len(delays)
         self._whole = delays.astype(np.int_)
         self.longest = int(self._whole[-1])
-        self._share = delays - self._whole
-        self._around = (self._whole, self._whole + 1) if self._share.any() else (self._whole,)
+        c = delays - self._whole
+        bend = -0.5 * c * (1.0 - c)
+        weights = np.stack([1.0 - c + bend, c - 2.0 * bend, bend]) if c.any() else np.ones((1, len(delays)))
+        self._weights = weights[..., None]
 
     @classmethod
     def up_to(cls, longest: float, period: float) -> Self:
@@ -89,21 +97,24 @@ class Candidates:
 
     def ends(self, past: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay, (..., D, columns)."""
-        return self._between(*(past[..., rows, :] for rows in self._around))
+        return weighted(self._weights, [past[..., self._whole + i, :] for i in range(len(self._weights))])
 
     def begins(self, past: FloatArray, periods: FloatArray) -> FloatArray:
         """Return the past (..., H, columns) at each delay and about `periods` (...) before, (..., D, columns)."""
-        whole = np.rint(periods).astype(np.int_)[..., None]
-        return self._between(*(pick(past, rows + whole, axes=1) for rows in self._around))
+        first = self._whole + np.rint(periods).astype(np.int_)[..., None]
+        return weighted(self._weights, [pick(past, first + i, axes=1) for i in range(len(self._weights))])
 
     def exposed(self, past: FloatArray, candidate: IntArray) -> FloatArray:
         """Return the past (..., H, columns) at a candidate delay (...) and a period before, (..., 2, columns)."""
-        whole, share = (np.take(each, candidate)[..., None] for each in (self._whole, self._share))
-        rows = pick(past, whole + LAST_THREE, axes=1)
-        return np.asarray(rows[..., :2, :] + share[..., None] * (rows[..., 1:, :] - rows[..., :2, :]))
+        count = len(self._weights)
+        rows = pick(past, np.take(self._whole, candidate)[..., None] + np.arange(count + 1), axes=1)
+        weights = [np.take(each, candidate, axis=0)[..., None] for each in self._weights]
+        return weighted(weights, [rows[..., i : i + 2, :] for i in range(count)])
 
-    def _between(self, row: FloatArray, before: FloatArray | None = None) -> FloatArray:
-        return row if before is None else np.asarray(row + self._share[:, None] * (before - row))
+
+def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> FloatArray:
+    """Return Σ_i w_i x_i."""
+    return np.asarray(sum(weight * row for weight, row in zip(weights, rows, strict=True)))
 
 
 class Known(NamedTuple):
@@ -195,9 +206,9 @@ class Pairing:
         self.delays = self._candidates.delays
         self.gap = MAX_GAP * motion
         self._doubtful = (DOUBTFUL * motion + 0.5) * spec.period
-        self._rows = self._candidates.longest + self.gap + DOUBTFUL * motion + 3
+        self._rows = self._candidates.longest + self.gap + DOUBTFUL * motion + 4
         self.regression = Regression(knowledge)
-        self._variances = np.concatenate([np.ones(self._m), np.full(self._n, REST_DEVIATION**2)])
+        self._variances = np.repeat([MAP_DEVIATION**2, REST_DEVIATION**2], [self._m, self._n])
 
     def start(self, observation: Observation, base: FloatArray) -> PairState:
         """Return the state of an arm that has rested, with J_n (..., m, n) there."""
