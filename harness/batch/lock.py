@@ -1,9 +1,7 @@
 """One process at a time in a results folder, and who it is.
 
 The lock is `flock` on the file `.lock`, which the system releases when the process ends. The file names its holder.
-Where the file system has no such locks (some network mounts), the existence of the file is the lock: the process that
-created it holds it, until that process is known to have ended. The processes of another machine are out of reach, so
-there the file stays until a user removes it.
+A file system without such locks (some network mounts) holds no results folder.
 """
 
 import contextlib
@@ -130,48 +128,18 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
     before = None
     while True:
         before = Holder.read(path) or before
-        descriptor, created = _open(path)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held = True
-        except BlockingIOError:
+        except OSError as error:
             os.close(descriptor)
-            raise ConfigurationError(_refusal(path, Holder.read(path) or before)) from None
-        except OSError:  # such as ENOLCK of a network mount without a lock service
-            held = created
-        if held and _same(path, descriptor):
+            if not isinstance(error, BlockingIOError):  # such as ENOLCK of a mount without a lock service
+                raise
+            holder = Holder.read(path) or before or UNREADABLE_OWNER
+            raise ConfigurationError(f"results folder {path.parent} is being written by {holder}") from None
+        if _same(path, descriptor):
             return descriptor, before
         os.close(descriptor)
-        if not held and path.exists():
-            _remove_stale(path, before)
-
-
-def _open(path: Path) -> tuple[int, bool]:
-    """Open the file of a lock and return whether it was created."""
-    try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
-    except FileExistsError:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), False
-
-
-def _remove_stale(path: Path, holder: Holder | None) -> None:
-    """Remove a file whose existence is the lock, if its process is known to have ended.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
-    if holder is None or not holder.gone:
-        raise ConfigurationError(f"{_refusal(path, holder)}; if it has ended, remove {path} and try again")
-    aside = path.with_name(f"{path.name}-{os.getpid()}")
-    with contextlib.suppress(FileNotFoundError):  # another process was quicker
-        path.rename(aside)
-        if Holder.read(aside) != holder:  # and has taken the lock
-            os.link(aside, path)
-        aside.unlink()
-
-
-def _refusal(path: Path, holder: Holder | None) -> str:
-    return f"results folder {path.parent} is being written by {holder or UNREADABLE_OWNER}"
 
 
 def _same(path: Path, descriptor: int) -> bool:
