@@ -11,8 +11,15 @@ import pytest
 from kit.toy import PERIOD, PREVIEW, Commanding, only_controller, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate
-from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw, update_share
-from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
+from servobench.controllers.laws.rbfnn import (
+    RbfnnConfig,
+    RbfnnLaw,
+    RollOut,
+    descent_direction,
+    roll_out,
+    update_share,
+    update_step,
+)
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
 from servobench.controllers.stages.finish import scale_to_limit
 
