@@ -9,9 +9,8 @@ from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import detectors
-from servobench.plant.rendered.depth import measure_depth
 from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
-from servobench.plant.rendered.detectors import DepthCamera
+from servobench.plant.rendered.detectors import DepthCamera, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.workspace import BALL_RADIUS

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from servobench.plant.rendered.depth import depth_deviation, measure_depth
 from servobench.plant.rendered.detection import Patch
+from servobench.plant.rendered.detectors import depth_deviation, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 

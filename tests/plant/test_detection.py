@@ -3,7 +3,6 @@ import colorsys
 import numpy as np
 import pytest
 
-from servobench.plant.rendered.depth import depth_deviation, measure_depth
 from servobench.plant.rendered.detection import (
     Detection,
     add_colour_noise,
@@ -13,6 +12,7 @@ from servobench.plant.rendered.detection import (
     fit_sphere,
     locate_ball,
 )
+from servobench.plant.rendered.detectors import depth_deviation, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 
