@@ -9,10 +9,9 @@ import pytest
 
 from kit.plants import NEEDS_BULLET, configure, setup
 from servobench.harness.config.registry import find_plant
-from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.bench import Bench, common_step
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
-from servobench.plant.contract.timing import common_step
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 
 RATES = (10, 20, 50, 125, 250)  # [Hz]
