@@ -25,7 +25,7 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
 from servobench.controllers.periods import check_preview, in_periods, sampled
 from servobench.controllers.stages.finish import largest_excess
-from servobench.controllers.stages.joint_response import pushed
+from servobench.controllers.stages.prediction import pushed
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, transposed
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings

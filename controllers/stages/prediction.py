@@ -4,14 +4,31 @@
     q̂ = q(k) + flight                               and the joints
     compared with the reference at k + lead
 
-flight and lead follow from the part of the commands that is still to come (`joint_response`). z is the feature at its
+flight and lead follow from the part of the commands that is still to come, as below. z is the feature at its
 exposure, d periods ago, as measured, or without the noise e that the regression finds in a frame:
 
     z ← z + Ĵ Δq(k−d)                               as far as the arm moved until the exposure
     z = y − e                                       with a valid feature y from which was learned
 
 Prediction and filter can each be left out.
+
+The response of the joints to commands is identified online. One finite response g, (..., N), holds for all joints:
+
+    Δq(k) = Σ_{i=1..N} g_i dq(k−i)
+
+where Δq(k) = q(k) − q(k−1) and dq(k−i) is the joint step that was commanded i periods ago. It covers the delay of a
+command and the lag of the joints. g minimises Σ ‖Δq − Σ g_i dq‖² + Σ ρ_i (g_i − g₀_i)², g₀ = (1, 0, …), which is a
+response without delay.
+The motion that is still to come of the commands so far, and the time that it takes at constant speed:
+
+    flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
+
+At fast rates Δq and dq are taken over a window of several periods, about `WINDOW` in all, and each period anew: the
+motion of a joint in one period is lost in the steps of its encoder. A response can also be given: a delay and a lag of
+first order.
 """
+
+from __future__ import annotations
 
 import copy
 import math
@@ -24,11 +41,134 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.estimation import Estimation, EstimationState
-from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.lanes import branch, transposed
 from servobench.plant.contract.signals import Observation
+
+WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
+PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it
+PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
+MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
+PREDICTION_TOLERANCE = 0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
+MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that does not overshoot
+
+
+class JointResponse(NamedTuple):
+    """The response g by regularised least squares over all joints, and the quantities derived from it."""
+
+    A: FloatArray  # (..., N, N), rad², the normal matrix
+    b: FloatArray  # (..., N), rad²
+    commands: FloatArray  # the commanded joint steps of the last periods, (..., N + w − 1, n), rad, the newest first
+    response: FloatArray  # g, (..., N)
+    left: FloatArray  # the part of each of the last N commands that is still to come, (..., N)
+    lead: FloatArray  # (...) [periods]
+    window: int  # w, periods
+    period: float  # s
+
+    @classmethod
+    def immediate(cls, length: int, joint_position: FloatArray, period: float, window: int = 1) -> JointResponse:
+        """Return the response g₀ of an arm that follows at once and rests.
+
+        Args:
+            length: N, periods.
+            joint_position: (..., n), of which only the shape counts.
+            period: s.
+            window: w, periods.
+        """
+        *lead, n = joint_position.shape
+        weights = PRIOR_WEIGHT * window**2 * period * np.exp(PRIOR_GROWTH * period * np.arange(length))
+        first = np.broadcast_to(np.eye(length)[0], (*lead, length))
+        A = np.broadcast_to(np.diag(weights), (*lead, length, length))
+        commands = np.zeros((*lead, length + window - 1, n))
+        state = cls(A, weights[0] * first, commands, first, first, np.zeros(lead), window, period)
+        return with_response(state, first)
+
+    @classmethod
+    def given(cls, delay: float, lag: float, period: float, length: int, joint_position: FloatArray) -> JointResponse:
+        """Return the response of joints with a delay and a first-order lag, which never changes.
+
+        Args:
+            delay: s, of a command.
+            lag: s, time constant of a joint's velocity; 0 for none.
+            period: s.
+            length: periods after which nothing is left.
+            joint_position: (..., n), of which only the shape counts.
+        """
+        *lead, n = joint_position.shape
+        left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
+        arrival = np.full(tuple(lead), np.add.reduce(left, axis=-1))[()]
+        nothing, commands = np.zeros((*lead, 0)), np.zeros((*lead, length, n))
+        return cls(nothing[..., None], nothing, commands, nothing, left, arrival, 1, period)
+
+    def command(self, joint_step: FloatArray) -> JointResponse:
+        """Return the state after the joint step (..., n), rad, was commanded."""
+        return self._replace(commands=pushed(self.commands, joint_step))
+
+    def learn(self, joint_step: FloatArray) -> JointResponse:
+        """Return the state after the joint step of the last window, (..., n), rad, unless it was predicted well."""
+        steps = self._steps()
+        error = joint_step - np.vecmat(self.response, steps)
+        least = PREDICTION_TOLERANCE * self.window * self.period
+        return branch(np.vecdot(error, error) >= least**2, _learned, self, joint_step, steps)
+
+    def flight(self) -> FloatArray:
+        """Return the joint motion (..., n), rad, that is still to come of the commands so far."""
+        return np.asarray(np.vecmat(self.left, self.commands[..., : self.left.shape[-1], :]))
+
+    def _steps(self) -> FloatArray:
+        """Return the commanded steps of the windows that end 1 … N periods ago, (..., N, n), rad."""
+        if self.window == 1:
+            return self.commands
+        sums = np.cumsum(self.commands, axis=-2)
+        first = sums[..., self.window - 1 : self.window, :]
+        later = sums[..., self.window :, :] - sums[..., : -self.window, :]
+        return np.concatenate([first, later], axis=-2)
+
+
+def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) -> JointResponse:
+    weight = 1.0 / state.window  # windows overlap
+    A = state.A + weight * (steps @ transposed(steps))
+    b = state.b + weight * np.matvec(steps, joint_step)
+    most = MAX_EXCITATION * state.window**2 * state.period
+    kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
+    A, b = kept[..., None] * A, kept * b
+    response = np.linalg.solve(A, b[..., None])[..., 0]
+    if state.window == 1:  # in longer windows single entries are not identified, and limits would shift their sum
+        response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)
+    return with_response(state._replace(A=A, b=b), response)
+
+
+def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
+    """Return the state with another response g, (..., N), and with the quantities derived from it."""
+    length = response.shape[-1]
+    ahead = response[..., ::-1].cumsum(axis=-1)[..., ::-1]  # g_i + … + g_N
+    left = np.zeros_like(ahead)
+    left[..., :-1] = ahead[..., 1:]
+    total = ahead[..., 0]
+    lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
+    return state._replace(response=response, left=left, lead=np.minimum(lead, length) * (total > 0.5))
+
+
+def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:
+    """Return the share of the joint step of one period that is still to come 1 … `length` periods later, (length,).
+
+    A velocity held for one period acts after the delay through v̇ = (u − v)/lag, so that after a time T of action the
+    joint has gone (f(T) − f(T − dt))/dt of its step, f(T) = T − lag (1 − exp(−T/lag)) for T > 0.
+    """
+    acted: FloatArray = np.asarray(period * (1.0 + np.arange(length)) - delay)
+
+    def travelled(time: FloatArray) -> FloatArray:
+        acting = np.maximum(time, 0.0)
+        return np.asarray(acting if lag == 0.0 else acting + lag * np.expm1(-acting / lag))
+
+    return np.asarray(1.0 - (travelled(acted) - travelled(acted - period)) / period)
+
+
+def pushed(history: FloatArray, newest: FloatArray) -> FloatArray:
+    """Return the history (..., length, k) with the newest value (..., k) first."""
+    return np.concatenate([newest[..., None, :], history[..., :-1, :]], axis=-2)
+
 
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 

@@ -12,9 +12,8 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
-from servobench.controllers.stages.joint_response import JointResponse, with_response
 from servobench.controllers.stages.pairing import Past
-from servobench.controllers.stages.prediction import Predictor, shifted
+from servobench.controllers.stages.prediction import JointResponse, Predictor, shifted, with_response
 from servobench.controllers.stages.regression import REST_DRIFT
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
