@@ -8,8 +8,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm
 
 State = TypeVar("State")
 MOTION_TIME: Final = 0.05  # [s] shortest motion at any control period, so that as much is learned per second
@@ -64,3 +65,22 @@ class Estimator(ABC, Generic[State]):
     def diagnostics(self, state: State) -> Diagnostics:
         """Return named numbers (...) about the last update, if there are any; for the log only."""
         return {}
+
+
+class GatedEstimator(Estimator[State]):
+    """An estimator whose settings have a minimum ‖Δq‖, below which motions are left out; its state says `updated`."""
+
+    def __init__(self, config: Any, knowledge: RobotKnowledge | None = None) -> None:  # noqa: ANN401 - its settings
+        """Take the settings; nothing about the robot is needed."""
+        self._config = config
+
+    def update(self, state: State, motion: Motion) -> State:
+        """Correct by one motion if it is large enough; see `Estimator.update`."""
+        known: Any = state
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        new: State = branch(large, self._correct, known._replace(updated=large), motion)
+        return new
+
+    @abstractmethod
+    def _correct(self, state: State, motion: Motion) -> State:
+        """Return the state after a motion that is large enough."""

@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple, TypeAlias, final
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import branch, norm, outer, plus_diagonal, transposed
+from servobench.plant.contract.lanes import outer, plus_diagonal, transposed
 from servobench.plant.contract.settings import Deviation, NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -151,7 +151,7 @@ class WalkState(NamedTuple):
 
 
 @final
-class RandomWalkEstimator(Estimator[WalkState]):
+class RandomWalkEstimator(GatedEstimator[WalkState]):
     """The random walk of J, corrected by the formula of a filter; motions below a minimum ‖Δq‖ are left out.
 
     J changes only where the arm moves, so a motion that is left out adds no process noise either.
@@ -159,7 +159,8 @@ class RandomWalkEstimator(Estimator[WalkState]):
 
     def __init__(self, config: RandomWalk, update: Update, covariance: Covariance) -> None:
         """Take the settings of the walk, the formula, and the form of its covariance."""
-        self._config, self._formula, self._covariance = config, update, covariance
+        super().__init__(config)
+        self._formula, self._covariance = update, covariance
         self._walk = config.walk**2
         self._noise: FloatArray = np.asarray(config.feature_noise)[()]
 
@@ -170,15 +171,6 @@ class RandomWalkEstimator(Estimator[WalkState]):
         shape = shapes[self._covariance]
         P = np.broadcast_to(np.eye(shape[-1]) * self._config.initial_deviation**2, (*lead, *shape))
         return WalkState(jacobian, P, np.full(lead, False))
-
-    def update(self, state: WalkState, motion: Motion) -> WalkState:
-        """Correct by one motion.
-
-        Raises:
-            FilterDiverged: a covariance is no longer positive definite.
-        """
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         noise: FloatArray = self._noise if motion.noise is None else motion.noise

@@ -16,10 +16,10 @@ from typing import Annotated, NamedTuple, final
 import numpy as np
 from annotated_types import Le, Lt
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, outer
+from servobench.plant.contract.lanes import branch, outer
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -77,7 +77,7 @@ class ProjectionState(NamedTuple):
 
 
 @final
-class ProjectionEstimator(Estimator[ProjectionState]):
+class ProjectionEstimator(GatedEstimator[ProjectionState]):
     """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / (μ + ‖Δq‖²) for every motion above a minimum ‖Δq‖; Broyden's update has μ = 0.
 
     Φ of the compact form goes back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
@@ -87,19 +87,12 @@ class ProjectionEstimator(Estimator[ProjectionState]):
     The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, and Φ stays.
     """
 
-    def __init__(self, config: BroydenConfig | CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings of either update; nothing about the robot is needed."""
-        self._config = config
+    _config: BroydenConfig | CfdlConfig
 
     def start(self, jacobian: FloatArray) -> ProjectionState:
         """Start from Ĵ₀, (..., m, n), m/rad."""
         lead = jacobian.shape[:-2]
         return ProjectionState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
-
-    def update(self, state: ProjectionState, motion: Motion) -> ProjectionState:
-        """Correct by one motion."""
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
 
     def _correct(self, state: ProjectionState, motion: Motion) -> ProjectionState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step

@@ -10,11 +10,11 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.controllers.estimators.kalman import WalkState, cholesky_of
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, outer, transposed
+from servobench.plant.contract.lanes import outer, transposed
 from servobench.plant.contract.settings import NonNegative, Positive, PositiveOrInfinite, settings
 
 
@@ -63,31 +63,20 @@ def rls_update(
 
 
 @final
-class RlsEstimator(Estimator[WalkState]):
+class RlsEstimator(GatedEstimator[WalkState]):
     """Ĵ ← Ĵ + (Δy − ĴΔq) Kᵀ with forgetting λ; motions below a minimum ‖Δq‖ are left out.
 
     Forgetting inflates P in directions in which nothing moves, without bound. So P is scaled back to a mean diagonal
     of at most `covariance_limit`; scaling keeps it symmetric and positive definite.
     """
 
-    def __init__(self, config: RlsConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings; nothing about the robot is needed."""
-        self._config = config
+    _config: RlsConfig
 
     def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with P (..., n, n), 1/rad²."""
         lead, n = jacobian.shape[:-2], jacobian.shape[-1]
         P = np.broadcast_to(np.eye(n) * self._config.initial_covariance, (*lead, n, n))
         return WalkState(jacobian, P, np.full(lead, False))
-
-    def update(self, state: WalkState, motion: Motion) -> WalkState:
-        """Correct by one motion.
-
-        Raises:
-            FilterDiverged: P is no longer positive definite.
-        """
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
