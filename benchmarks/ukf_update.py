@@ -13,8 +13,7 @@ from functools import partial
 import numpy as np
 
 from measuring import asked_to_be_quick, table, times_in_turns
-from servobench.controllers.estimators.kalman import split_update
-from servobench.controllers.estimators.ukf import sigma_weights, unscented_update
+from servobench.controllers.estimators.kalman import sigma_weights, split_update, unscented_update
 
 M, N, MOTIONS, FACTOR, BLOCK = 3, 6, 200, 8.0, 128
 SIZE = M * N

@@ -11,10 +11,14 @@ from servobench.controllers.estimators.constant import ConstantEstimator, TrueCo
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     RandomWalkEstimator,
+    UkfConfig,
     kalman_estimator,
     kalman_update,
     measurement_matrix,
+    sigma_weights,
     split_update,
+    ukf_estimator,
+    unscented_update,
 )
 from servobench.controllers.estimators.projection import (
     BroydenConfig,
@@ -23,7 +27,6 @@ from servobench.controllers.estimators.projection import (
     projection_update,
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
-from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update
 
 LEARNING = [
     ProjectionEstimator(BroydenConfig(step_factor=1.0)),
