@@ -29,10 +29,16 @@ from servobench.controllers.controller import Controller, ControllerEntry, Diagn
 from servobench.controllers.estimators import correntropy
 from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.estimator import Estimator
-from servobench.controllers.estimators.kalman import KalmanConfig, UkfConfig, kalman_estimator, ukf_estimator
+from servobench.controllers.estimators.kalman import (
+    KalmanConfig,
+    RlsConfig,
+    RlsEstimator,
+    UkfConfig,
+    kalman_estimator,
+    ukf_estimator,
+)
 from servobench.controllers.estimators.projection import BroydenConfig, CfdlConfig, ProjectionEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfLyapunovConfig, RbfLyapunovEstimator
-from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
 from servobench.controllers.estimators.robust_filter import RobustConfig, RobustEstimator
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Estimate, Law

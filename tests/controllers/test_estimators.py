@@ -11,10 +11,13 @@ from servobench.controllers.estimators.constant import ConstantEstimator, TrueCo
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     RandomWalkEstimator,
+    RlsConfig,
+    RlsEstimator,
     UkfConfig,
     kalman_estimator,
     kalman_update,
     measurement_matrix,
+    rls_update,
     sigma_weights,
     split_update,
     ukf_estimator,
@@ -26,7 +29,6 @@ from servobench.controllers.estimators.projection import (
     ProjectionEstimator,
     projection_update,
 )
-from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
 
 LEARNING = [
     ProjectionEstimator(BroydenConfig(step_factor=1.0)),

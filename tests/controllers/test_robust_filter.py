@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kit.toy import Learning, motion
-from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
-from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
+from servobench.controllers.estimators.kalman import KalmanConfig, RlsConfig, RlsEstimator, kalman_estimator
 from servobench.controllers.estimators.robust_filter import (
     BISQUARE,
     MEMORY,
