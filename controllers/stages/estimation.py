@@ -38,6 +38,7 @@ class Learned(NamedTuple):
     """The states that change with a motion."""
 
     estimator: Any  # state of the estimator
+    anchor: Any  # its state at the pair stage's anchor, which returns if later frames were false
     pair: Any  # state of the pair stage; None without one
     unexplained: FloatArray  # ‖Δy − ĴΔq‖, (...), with Ĵ from before the update; NaN before there is a motion
 
@@ -82,7 +83,7 @@ class Estimation:
         pair = None if self.pairing is None else self.pairing.start(observation, base)
         unknown, never = np.full(jacobian.shape, np.nan), np.full(lead, np.nan)[()]
         last = LastFrame(never, q, observation.feature, observation.valid, unknown)
-        return EstimationState(Learned(estimator, pair, never), last, unknown, unknown)
+        return EstimationState(Learned(estimator, estimator, pair, never), last, unknown, unknown)
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; without a valid feature nothing is learned.
@@ -104,7 +105,8 @@ class Estimation:
         learned = branch(known, self._learn, learned, last, observation, desired, both)
         if self.pairing is not None:
             pair = branch(due & np.logical_not(known), self.pairing.interrupt, learned.pair)
-            learned = learned._replace(pair=pair)
+            anchor = branch(pair.anchor.miss == 0.0, _other, learned.anchor, learned.estimator)
+            learned = learned._replace(anchor=anchor, pair=pair)
         own = self.estimator.deviation(learned.estimator, self._first, q)
         jacobian = own if self.pairing is None else self._with_model(own, learned, q, learned.pair.base)
         lead = observation.feature.shape[:-1]
@@ -168,27 +170,33 @@ class Estimation:
         self, learned: Learned, last: LastFrame, observation: Observation, desired: FloatArray, valid: BoolArray
     ) -> Learned:
         """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
-        dy, error = observation.feature - last.feature, desired - observation.feature
-        duration, pairing, noise = observation.time - last.time, self.pairing, None
+        error, pairing, noise = desired - observation.feature, self.pairing, None
+        dy, duration = observation.feature - last.feature, observation.time - last.time
         q, pair, explained = last.joint_position, learned.pair, np.zeros_like(dy)
         step = observation.joint_position - q
         if pairing is not None:
-            before = pair
-            pair, (q, step, x, h) = pairing.learn(pair, dy, duration, valid)
+            pair, paired = pairing.learn(pair, dy, duration, valid)
+            dy, duration, valid, q, step, x, h, before, back = paired
+            learned = learned._replace(estimator=branch(back, _other, learned.estimator, learned.anchor))
             noise = pairing.noise(pair)
             if self._filters:
-                dy = dy - (pair.regression.mean[..., -1] - before.regression.mean[..., -1])
+                dy = dy - (pair.regression.mean[..., -1] - before.mean[..., -1])
             if self._model != "own":
-                explained = x if self._model == "nominal" else pairing.regression.explained(before.regression, h)
+                explained = x if self._model == "nominal" else pairing.regression.explained(before, h)
             if self._first is not None:
                 explained = explained - np.matvec(self.estimator.jacobian(self._first, q), step)
         predicted = np.matvec(last.jacobian, step)
         dy = np.where(valid, dy, predicted)
         motion = Motion(q, step, dy - explained, error, duration, noise)
-        return Learned(self.estimator.update(learned.estimator, motion), pair, norm(dy - predicted))
+        estimator = self.estimator.update(learned.estimator, motion)
+        return learned._replace(estimator=estimator, pair=pair, unexplained=norm(dy - predicted))
 
     def diagnostics(self, state: EstimationState) -> Diagnostics:
         """Return the diagnostics of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""
         learned = state.learned
         found = {"jacobian_prediction_error": learned.unexplained, **self.estimator.diagnostics(learned.estimator)}
         return found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
+
+
+def _other(_: Any, other: Any) -> Any:  # noqa: ANN401 - states of an estimator
+    return other

@@ -157,12 +157,17 @@ class PairState(NamedTuple):
 
 
 class Paired(NamedTuple):
-    """A motion of the feature and the joint motion that belongs to it."""
+    """A motion of the feature and the joint motion that belongs to it; it begins at the anchor after a false frame."""
 
+    feature_step: FloatArray  # Δy, (..., m)
+    duration: FloatArray  # (...), s
+    valid: BoolArray  # (..., m), features that were measured at both ends
     joint_position: FloatArray  # (..., n), rad, where the joint motion began
     joint_step: FloatArray  # Δq, (..., n), rad
     predicted: FloatArray  # x = J_n Δq, (..., m)
     h: FloatArray  # its regressors in the regression
+    before: RegressionState  # the regression before it
+    back: BoolArray  # (...), whether a false frame was taken back
 
 
 class Past(NamedTuple):
@@ -275,7 +280,7 @@ class Pairing:
         motion = branch(back, lambda _, whole: whole, (feature_step, duration, valid), (step, total, since.valid))
         periods, shorter = duration / self._period, (anchor.miss > 0.0) & ~back
         begin = branch(shorter, lambda _, *last: self._candidates.begins(*last), first, state.past, periods)
-        state, paired = self._learned(state, motion, begin, end)
+        state, paired = self._learned(state, motion, begin, end, back)
         least, state = DOUBT * state.noise.variance, state.anchored()
         doubtful = ~back & (total < self._doubtful) & (miss > least)
         since = since._replace(miss=branch(doubtful, self._miss, miss, since, first, end))
@@ -283,7 +288,12 @@ class Pairing:
         return state._replace(anchor=anchor), paired
 
     def _learned(
-        self, state: PairState, motion: tuple[FloatArray, FloatArray, BoolArray], begin: FloatArray, end: FloatArray
+        self,
+        state: PairState,
+        motion: tuple[FloatArray, FloatArray, BoolArray],
+        begin: FloatArray,
+        end: FloatArray,
+        back: BoolArray,
     ) -> tuple[PairState, Paired]:
         """Return `learn` from a motion that is believed, with the past at both of its ends, (..., D, n + m)."""
         n, (feature_step, duration, valid) = self._n, motion
@@ -294,7 +304,8 @@ class Pairing:
         state = self._find_delay(state, h, np.where(valid, feature_step, foreseen), valid)
         begin, passed = pick(begin, state.candidate), pick(passed, state.candidate)
         q, step, x = begin[..., :n], passed[..., :n], passed[..., n:]
-        paired = Paired(q, step, x, self.regression.regressors(q + 0.5 * step, step, x))
+        h = self.regression.regressors(q + 0.5 * step, step, x)
+        paired = Paired(*motion, q, step, x, h, state.regression, back)
         foreseen = self.regression.explained(state.regression, paired.h) - state.regression.mean[..., -1]
         dy = np.where(valid, feature_step, foreseen)
         regression = self.regression.update(state.regression, paired.h, dy, duration, state.noise.variance)

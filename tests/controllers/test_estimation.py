@@ -95,10 +95,33 @@ def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_bega
 def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_frames():
     q, recorder = path(12), Recorder()
     y = features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))
-    states, _ = follow(recorder, q, y, filter=True)
+    states, _ = follow(recorder, q, y, filter=True, feature_noise=0.01)
     e = np.array([state.learned.pair.regression.mean[:, -1] for state in states])
     assert np.abs(e[1:]).min(axis=1).all()
     np.testing.assert_allclose([each.feature_step for each in recorder.motions], np.diff(y - e, axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["own", "regression"])
+def test_what_an_estimator_learned_from_false_frames_is_taken_back_with_them(model):
+    """Once the next true frame is seen, it has learned from the motion over both as if they had been lost."""
+    q, found = path(40), []
+    y, valid = features(q, np.eye(M)), np.full(len(q), True)
+    valid[[20, 29, 30]] = False
+    for false in (0.0, 0.3):
+        shown = y + np.where(valid, 0.0, false)[:, None]
+        stages = Estimation(
+            ProjectionEstimator(BroydenConfig()),
+            MODELLED,
+            AidsConfig(model=model, filter=True, feature_noise=5e-4),
+            NONE,
+        )
+        state = stages.start(Observation(0.0, q[0], y[0]), np.full((M, N), 0.1))
+        for k in range(len(q)):
+            seen = valid[k] if false == 0.0 else True
+            state = stages.update(state, Observation(k * PERIOD, q[k], shown[k], seen), np.zeros(M))
+        found.append((state.learned.estimator.J, state.jacobian))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-12)
+    assert np.linalg.norm(found[0][0]) > 0.1
 
 
 def path(steps, seed=1):
