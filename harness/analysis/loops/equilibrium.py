@@ -98,13 +98,14 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     Of the past joint positions only those are kept that the present delay needs.
     """
     other, pairing, estimation = copy.copy(servo), servo.estimation.pairing, state.estimation
-    estimation = estimation._replace(learned=estimation.learned._replace(estimator=None))  # it may be large
+    learned = estimation.learned._replace(estimator=None, anchor=None)  # they may be large
+    estimation = estimation._replace(learned=learned)
     other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
     if pairing is not None:
         pair = estimation.learned.pair
         other.predictor = None if servo.predictor is None else servo.predictor.frozen(float(pair.regression.share))
         window = 0 if servo.predictor is None else servo.predictor.window
-        rows = max(int(pairing.delay(pair)) + 3, window + 1)
+        rows = max(int(pairing.delay(pair)) + 4, window + 1)
         learned = estimation.learned._replace(pair=pair._replace(past=pair.past[:rows]))
         estimation = estimation._replace(learned=learned)
     return other, state._replace(estimation=estimation)
