@@ -106,13 +106,19 @@ class FmuDescription:
         return tuple(variable for name in names for variable in self.find(name, role, types))
 
     def resized(self, sizes: Mapping[str, int]) -> Self:
-        """Return the description with other values of structural parameters, which give the sizes of arrays."""
+        """Return the description with other values of structural parameters, which give the sizes of arrays.
+
+        Raises:
+            ValueError: an array becomes too large.
+        """
         if not sizes:
             return self
 
         def resize(variable: Variable) -> Variable:
             axes = tuple((name, sizes.get(name, size)) for name, size in variable.dimensions)
-            return replace(variable, size=prod(size for _, size in axes), dimensions=axes) if axes else variable
+            if (size := prod(size for _, size in axes)) > MAX_NUMBERS:
+                raise _bad_size(variable, self.path, size)
+            return replace(variable, size=size, dimensions=axes) if axes else variable
 
         return replace(self, variables=tuple(resize(variable) for variable in self.variables))
 

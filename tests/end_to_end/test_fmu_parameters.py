@@ -100,6 +100,12 @@ def test_a_value_of_another_type_is_one_clear_line(tmp_path, version, parameters
         moved(path, version, parameters=parameters)
 
 
+def test_a_structural_parameter_that_makes_an_array_too_large_is_one_clear_line(tmp_path):
+    path = build_crane(tmp_path / "crane.fmu", 3)
+    with pytest.raises(ValueError, match="the size of 'probe' must be a whole number up to 1,000,000, got 1000001"):
+        moved(path, 3, parameters={"samples": 1_000_001.0})
+
+
 def test_a_step_that_the_fmu_cannot_take_names_the_remedy(tmp_path):
     fixed = describe_with(3, 'modelIdentifier="crane"', 'modelIdentifier="crane" fixedInternalStepSize="0.02"')
     path = build_crane(tmp_path / "crane.fmu", 3, description=fixed)
