@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
 
@@ -24,6 +25,7 @@ from PIL import Image
 from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.units import split_quantity
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
@@ -315,19 +317,24 @@ def save_figure(
             box = Bbox.from_extents(0.0, drawn.y0, figure.get_figwidth(), drawn.y1)
     for ending in formats:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
-        with figure_style(TEXT):
-            if ending == "png" and box is None:  # drawn once; `savefig` would draw it twice
-                figure.set_dpi(RESOLUTION)
-                FigureCanvasAgg(figure).print_png(paths[-1], **UNDATED[ending])  # type: ignore[no-untyped-call]
-            else:
-                figure.savefig(paths[-1], dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
-        if ending == "pgf":  # without a package for underscores
-            text = PGF_TEXT.sub(
-                lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), paths[-1].read_text()
-            )
-            paths[-1].write_text(text)
+        write_atomically(paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box)))
         figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
     return paths
+
+
+def _encode(figure: Figure, ending: str, box: Bbox | None) -> bytes:
+    """Return the content of a file: a writer of PDF that finds no room on the disk ends in an error of its own."""
+    content = io.StringIO() if ending == "pgf" else io.BytesIO()
+    with figure_style(TEXT):
+        if ending == "png" and box is None:  # drawn once; `savefig` would draw it twice
+            figure.set_dpi(RESOLUTION)
+            FigureCanvasAgg(figure).print_png(content, **UNDATED[ending])  # type: ignore[no-untyped-call]
+        else:
+            figure.savefig(content, format=ending, dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
+    made = content.getvalue()
+    if isinstance(made, bytes):
+        return made
+    return PGF_TEXT.sub(lambda own: UNDERSCORE.sub(lambda sign: sign[1] or r"\_", own[0]), made).encode()
 
 
 def box_of(figure: Figure) -> Bbox:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -28,6 +29,7 @@ from servobench.harness.studies.claims import (
     studies,
 )
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.files import write_atomically
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
 FIGURES: Final = "figures"
@@ -78,7 +80,7 @@ def reproduce(
     answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
     results.write_summary(out, main, manifest)
     write_tables(answers, out)
-    (out / "answers.md").write_text(markdown_table(answers), encoding="utf-8")
+    write_atomically(out / "answers.md", partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"))
     draw_answers(answers, out / FIGURES)
     return answers
 
@@ -128,7 +130,8 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:
     """Write a row for each claim, plant and division, and a row for each number behind the answers."""
-    pd.DataFrame(answers).drop(columns="measurements").to_csv(folder / ANSWERS, index=False)
+    table = pd.DataFrame(answers).drop(columns="measurements")
+    write_atomically(folder / ANSWERS, partial(table.to_csv, index=False))
     rows = [
         {"claim": answer.claim, "plant": answer.plant, "division": answer.division,
          "measured": m.panel, "place": m.place, "label": m.label,
@@ -136,7 +139,7 @@ def write_tables(answers: Sequence[Answer], folder: Path) -> None:
         for answer in answers
         for m in answer.measurements
     ]  # fmt: skip
-    pd.DataFrame(rows).to_csv(folder / MEASUREMENTS, index=False)
+    write_atomically(folder / MEASUREMENTS, partial(pd.DataFrame(rows).to_csv, index=False))
 
 
 def read_answers(path: Path) -> Answers:

@@ -8,6 +8,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -34,6 +35,7 @@ from servobench.harness.pictures.measures import Curves, draw_curves, same_curve
 from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
@@ -157,7 +159,8 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
     limits: dict[str, float] = {}
     if any(line.axis == LATENCY for line in lines) and batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED:
         limits = predicted_limits(batch.controllers, settings, batch.robot)
-    pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
+    column = pd.Series(limits, name="predicted_latency_limit_s")
+    write_atomically(out / LIMITS, partial(column.to_csv, index_label="controller"))
     return draw_map(map_runs(out), out / FIGURES, limits)
 
 

@@ -65,7 +65,7 @@ def carry_out_suite(
     judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
     write_csv(judged, out / RUNS)
     for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
-        pd.json_normalize(as_plain(rows)).to_csv(out / name, index=False)
+        write_csv(pd.json_normalize(as_plain(rows)), out / name)
     for plant, own in bounded(judged).groupby("plant", sort=False):
         draw_suite(own, out / f"{PICTURE}_{Path(str(plant)).stem}")
     return judged

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from kit.command import servobench
+from kit.command import no_file_above, servobench
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.studies import claims, reproduction
 from servobench.harness.studies.claims import (
@@ -183,6 +183,13 @@ def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, num
     write_tables([replace(answer, evidence="circle 10.0 [9.0, 12.5] mm in 38 of 40")], tmp_path)
     found = [replace(answer, evidence=f"circle {number} mm in 37 of 40")]
     assert (differences(found, read_answers(tmp_path / "answers.csv")) == []) == same
+
+
+def test_a_table_of_answers_for_which_there_is_no_room_is_named_and_not_half_there(tmp_path):
+    with no_file_above(10), pytest.raises(OSError, match="File too large") as caught:
+        write_tables(answer_all(tables(), "kinematic"), tmp_path)
+    assert caught.value.filename == str(tmp_path / "answers.csv")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_committed_table_is_compared_line_by_line(tmp_path):

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from kit.command import no_file_above
 from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.comparison import Estimate
@@ -202,3 +203,15 @@ def test_a_name_that_the_font_lacks_is_drawn_without_a_word(tmp_path):
         figure = Figure()
         figure.text(0.5, 0.5, "\x00\U0001f600")
     assert [path.name for path in save_figure(figure, tmp_path / "a", ["png"])] == ["a.png"]
+
+
+@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
+def test_a_figure_for_which_there_is_no_room_is_named_and_the_old_one_stays(ending, tmp_path):
+    path = tmp_path / f"a.{ending}"
+    path.write_text("old")
+    figure = Figure()
+    figure.subplots().plot([0.0, 1.0])
+    with no_file_above(1000), pytest.raises(OSError, match="File too large") as caught:
+        save_figure(figure, tmp_path / "a", [ending])
+    assert caught.value.filename == str(path)
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [(path.name, "old")]

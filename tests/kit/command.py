@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pandas as pd
@@ -65,6 +67,17 @@ def wait_for(condition: Callable[[], bool]) -> None:
 def part_count(folder: Path) -> int:
     """Return how many parts a batch has finished so far."""
     return len(list((folder / results.PARTS).glob(f"[0-9]*.{results.RUNS}")))
+
+
+@contextmanager
+def no_file_above(size: int) -> Iterator[None]:
+    """Let each write beyond a size [bytes] of a file fail, as beyond a quota or on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def judged(table: pd.DataFrame) -> pd.DataFrame:
