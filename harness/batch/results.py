@@ -261,14 +261,15 @@ def load_runs(folder: Path) -> pd.DataFrame:
 
 
 def describe_missing(folder: Path) -> str:
-    """Return a line for the user that a batch is unfinished; an empty text if it is finished.
+    """Return a line for the user that a batch is unfinished, or has no checksums; else an empty text.
 
     Raises:
         ConfigurationError: as for `load_runs`.
     """
     check_folder(folder)
     count = sum(tables.row_count(folder, name) for name in _intact(folder, RUNS))
-    return missing_line(count, read_manifest(folder).get("run_count", 0))
+    unvouched = f"{SUMS} is missing, so that nothing vouches for the tables" if sums_of(folder) is None else ""
+    return "; ".join(filter(None, (missing_line(count, read_manifest(folder).get("run_count", 0)), unvouched)))
 
 
 def missing_line(count: int, wanted: int) -> str:

@@ -394,6 +394,18 @@ def test_commands_first_say_how_many_runs_of_a_batch_are_missing(monkeypatch, ca
     assert "runs are there" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [("export", "--out", "FILES"), ("statistics",)])
+def test_commands_first_say_that_a_folder_has_lost_its_checksums(monkeypatch, capsys, tmp_path, command):
+    folder = tmp_path / "out"
+    results.create_folder(folder, {"run_count": 2})
+    add_part(folder, 0)
+    (folder / SUMS).unlink()
+    words = [command[0], str(folder), *(str(tmp_path / "files") if word == "FILES" else word for word in command[1:])]
+    assert servobench(monkeypatch, *words) == 0
+    line = "1 of 2 runs are there: --resume carries out the others; SHA256SUMS is missing, so that nothing vouches for"
+    assert capsys.readouterr().out.startswith(line)
+
+
 def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, tmp_path):
     folder = tmp_path / "out"
     results.create_folder(folder, {"run_count": 3})
