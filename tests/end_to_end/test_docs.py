@@ -8,13 +8,16 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 import generated_tables
 from kit import console
+from kit.browser import browser_page, find_browser
 from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
 from kit.foreign_fmu import build_crane
 from kit.own import install
@@ -149,6 +152,15 @@ def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
     assert "joint_position_luff_rad" in result.steps
 
 
+def overhang(place: Path, width: int) -> int:
+    """Return by how many pixels a table of a page is wider than its room in a window of some width, at most."""
+    over = "Math.max(...[...document.querySelectorAll('.table-wrapper')].map(t => t.scrollWidth - t.clientWidth))"
+    with tempfile.TemporaryDirectory() as profile, browser_page(Path(profile)) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=1000, deviceScaleFactor=1, mobile=False)
+        page.open(place)
+        return int(page.evaluate(over))
+
+
 def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     pytest.importorskip("sphinx", reason="the extra docs is not installed")
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", "-b", "html"]
@@ -161,6 +173,8 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     order = ("make run", "servobench run --plant", "TABLE", "Start", "How to", "Reference", "Explanation")
     places = [shown.index(word) for word in order]
     assert places == sorted(places)
+    if find_browser() is not None:
+        assert overhang(tmp_path / "index.html", 1024) <= 0
     loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]*)"', index)
     assert loaded
     assert [place for place in loaded if "//" in place] == []  # it opens without a network
