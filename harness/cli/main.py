@@ -172,9 +172,11 @@ def _line_of_system(error: OSError) -> str | None:
 
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)
+    if error.errno == errno.ENOENT and "temporary directory" in str(error):  # of tempfile
+        return "no temporary folder takes a file; free room in one, or name another: TMPDIR=FOLDER servobench ..."
     if error.errno not in FULL:
         return None
-    return f"{os.strerror(error.errno)}{f' ({error.filename})' if error.filename else ''}"
+    return f"{os.strerror(error.errno)} ({error.filename or 'in the temporary folder or in the one that is written'})"
 
 
 def _line_for_user(error: ValueError | ImportError | RecursionError) -> str | None:

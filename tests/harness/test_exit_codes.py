@@ -7,11 +7,12 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from functools import partial
 
 import pytest
 
-from kit.command import PACKAGE, servobench
+from kit.command import PACKAGE, no_file_above, servobench
 from kit.resting import Resting
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
@@ -111,8 +112,19 @@ def test_a_full_disk_is_one_line(call, monkeypatch, capsys):
     monkeypatch.setattr("servobench.harness.batch.results.write_part", write)
     assert call(*SWEEP, "constant") == 1
     assert capsys.readouterr().err == (
-        "servobench: No space left on device; finished runs are kept, --resume continues\n"
+        "servobench: No space left on device (in the temporary folder or in the one that is written); finished runs "
+        "are kept, --resume continues\n"
     )
+
+
+def test_a_temporary_folder_without_room_is_one_line(call, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", None)  # it is sought anew
+    with no_file_above(0):
+        assert call("fmu", "export", "--output", str(tmp_path / "arm.fmu")) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("servobench: no temporary folder takes a file; free room in one, or name another: TMPDIR=")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_segmentation_fault_says_in_which_line(tmp_path):
