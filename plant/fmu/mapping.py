@@ -188,6 +188,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         if variable.unit != given and {variable.unit, given} <= UNITS["m"].keys():
             raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {given}")
     n, m = total_size(inputs), total_size(features)
+    if not (n and m):
+        raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
     if mapping.features == mapping.joints:
         remark(
             f"features of the mapping are its joints, {', '.join(mapping.joints)}; a camera measures other quantities"

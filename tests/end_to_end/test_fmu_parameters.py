@@ -82,6 +82,12 @@ def test_a_structural_parameter_gives_an_array_its_size(tmp_path):
     world.close()
 
 
+def test_a_structural_parameter_that_leaves_no_feature_is_one_clear_line(tmp_path):
+    path = build_crane(tmp_path / "crane.fmu", 3)
+    with pytest.raises(ValueError, match="inputs and features must name at least one number each, got 2 and 0"):
+        moved(path, 3, features=("probe",), parameters={"samples": 0.0})
+
+
 @pytest.mark.parametrize(
     ("version", "parameters", "message"),
     [
