@@ -15,6 +15,14 @@ from servobench.harness.studies.tuning.spaces import default_values, find_tunabl
 SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]
 
 
+def test_code_of_users_has_no_search_space_and_is_not_imported(monkeypatch, capsys, tmp_path):
+    (tmp_path / "mine.py").write_text("import pathlib\n\npathlib.Path(__file__).with_name('imported').touch()\n")
+    place = f"{tmp_path / 'mine.py'}:Mine"
+    assert servobench(monkeypatch, "tune", "--controllers", place, "--out", str(tmp_path / "out")) == 2
+    assert capsys.readouterr().err.startswith(f"servobench: controller {place} has no search space: valid: ")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
+
+
 def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypatch, capsys, tmp_path):
     out = tmp_path / "out"
     assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(out)) == 0
