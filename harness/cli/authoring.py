@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError
@@ -134,11 +134,11 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
     """
-    from servobench.harness.config.registry import choose_controller, find_controller
+    from servobench.harness.config.registry import find_controller
     from servobench.harness.run.shadow import differences, has_commands, predictions
     from servobench.harness.run.shadow import shadow as see
 
-    chosen = None if controller is None else choose_controller(controller)
+    chosen = None if controller is None else selection.choose("controllers", controller)
     if chosen is not None and find_controller(chosen).needs_truth and not log.is_dir():
         raise ConfigurationError(f"controller {chosen} is given the true robot, which {log} does not have")
     resolved, table = _logged(log, run, chosen, (robot, sensing), out)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.fmus.compiler import Platform, parse_platforms
-from servobench.harness.cli import options
+from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
 from servobench.harness.cli.terminal import FAILED, console, say, writing
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -47,10 +47,9 @@ class Export:
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
-        from servobench.harness.config.registry import choose_controller
         from servobench.harness.run.request import RunRequest, read_mismatch
 
-        names = "kinematic", choose_controller(controller), "target"
+        names = "kinematic", selection.choose("controllers", controller), "target"
         settings.check_sections([*names, "run"])
         return RunRequest(*names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing)
 

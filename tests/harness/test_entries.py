@@ -256,6 +256,9 @@ COMMANDS = {
     "list": ("controllers", "./mine.py"),
     "plant": ("run", "constant", "--plant", "./mine.py", "--out", "out"),
     "check": ("check", "./mine.py"),
+    "shadow": ("shadow", "log.csv", "--controller", "./mine.py"),
+    "fmu export": ("fmu", "export", "--controller", "./mine.py", "--output", "mine.fmu"),
+    "fmu ssp": ("fmu", "ssp", "--controller", "./mine.py", "--output", "loop.ssp"),
 }
 
 
