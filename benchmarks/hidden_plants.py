@@ -39,14 +39,20 @@ def parameters(true: RobotModel, nominal: RobotModel) -> dict[str, float]:
     return values
 
 
-def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
-    """Identify one hidden plant, and return a row a parameter."""
+def draw_hidden(seed: int, plant: str) -> tuple[str, str, dict[str, Any]]:
+    """Return robot, mismatch and settings of a hidden plant: latency, delay, lag and noise."""
     draws = np.random.default_rng(seed)
     robot, mismatch = str(draws.choice(ARMS)), str(draws.choice(MISMATCHES))
     latency, delay, lag = (round(float(draws.uniform(0.0, most)), 3) for most in (0.13, 0.06, 0.1))
     shape = np.diag(draws.uniform(0.5, 2.0, 3))
     sections: dict[str, Any] = {"sensing": {"latency": latency, "noise_shape": shape.tolist()}, "command_delay": delay}
-    sections |= {"lag": max(lag, 0.01)} if plant == "kinematic" else {"scenery": False}
+    return robot, mismatch, sections | ({"lag": max(lag, 0.01)} if plant == "kinematic" else {"scenery": False})
+
+
+def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
+    """Identify one hidden plant, and return a row a parameter."""
+    robot, mismatch, sections = draw_hidden(seed, plant)
+    latency, delay = sections["sensing"]["latency"], sections["command_delay"]
     settings = {plant: sections, "random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
     chosen: dict[str, Any] = {"robot": robot, "mismatch": mismatch, "seed": seed}
     made = servobench.run("docs/examples/excite.py", plant, task="random", settings=settings, **chosen)

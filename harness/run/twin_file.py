@@ -141,7 +141,8 @@ def twin_text(robot: Identified, log: Log, response: Response | None, named: tup
         top |= {"outliers": 1.0 - float(robot.inliers.mean()), "outlier_size": size}
     top |= {"parameters": names, "factor": factor}
     pose = f'{{ frame = "base", position = {toml(robot.pose[:3, 3])}, rotation = {toml(robot.pose[:3, :3])} }}'
-    camera = {"latency": float(robot.values[robot.names.index("latency")]), "rate": 1.0 / frame_period(log)}
+    latency = max(0.0, float(robot.values[robot.names.index("latency")]))  # an estimate of 0 may fall below it
+    camera = {"latency": latency, "rate": 1.0 / frame_period(log)}
     lines = [f"{key} = {toml(value)}" for key, value in top.items()]
     lines += ["[camera]", *(f"{key} = {toml(value)}" for key, value in camera.items()), f"pose = {pose}"]
     return "\n".join([*lines, "[mean]", *(f"{key} = {toml(value)}" for key, value in mean.items())]) + "\n"

@@ -158,8 +158,8 @@ class Twin:
             sensing |= {"feature_noise": f"{scale}{unit}" if unit else scale, "noise_shape": shape.tolist()}
         if keys.outliers > 0.0:
             sensing["outlier_size"] = f"{keys.outlier_size}{unit}" if unit else keys.outlier_size
-        if keys.camera.rate is not None:
-            sensing["frame_period"] = max(1, round(1.0 / (keys.camera.rate * period))) * period
+        if keys.camera.rate is not None and (rows := round(1.0 / (keys.camera.rate * period))) > 1:
+            sensing["frame_period"] = rows * period  # else frames of any age arrive at control instants
         known = {each.name for each in fields(config)}
         return {name: value for name, value in {**times, "sensing": sensing}.items() if name in known}
 

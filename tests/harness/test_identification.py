@@ -248,6 +248,15 @@ def test_a_twin_has_the_features_and_the_uncertainty_of_the_log(tmp_path):
     assert 1e-5 < np.std(drawn, axis=0).mean() < 1e-3
 
 
+def test_a_latency_that_is_estimated_below_0_is_0_in_a_twin(tmp_path):
+    found, path = identified(), tmp_path / "twin.toml"
+    values = found.values.copy()
+    values[found.names.index("latency")] = -2e-4
+    log = logged()[0]
+    path.write_text(twin_text(replace(found, values=values), log, command_response(log), (ROBOT, "position")), "utf-8")
+    assert find_robot(str(path)).twin.times(0)["sensing.latency"] == 0.0
+
+
 def test_the_command_writes_a_twin_that_other_commands_take(tmp_path, monkeypatch, capsys):
     _, table, _ = logged()
     log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"

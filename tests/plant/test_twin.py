@@ -79,6 +79,13 @@ def test_the_plant_has_the_times_and_the_noise_of_the_twin(twin):
     assert resolve(request(twin), Settings()).plant.command_delay == 0.02
 
 
+@pytest.mark.parametrize(("rate", "frame_period"), [(20.0, 0.0), (10.0, 0.1)])
+def test_frames_at_the_control_rate_are_as_late_as_the_log_says(tmp_path, rate, frame_period):
+    """A grid of frames would round the latency of 83 ms up to the next control instant."""
+    robot = written(tmp_path, TWIN.replace("latency = 0.083", f"latency = 0.083\nrate = {rate}"))
+    assert resolve(request(robot), Settings()).plant.sensing.frame_period == frame_period
+
+
 def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
     drawn = {seed: resolve(request(twin, seed), Settings()).plant.sensing.latency for seed in range(6)}
     assert len(set(drawn.values())) > 3
