@@ -16,6 +16,7 @@ over the methods i of a plant, where a pair whose medians on the plant are withi
 import argparse
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -41,7 +42,7 @@ from servobench.plant.robot.mismatch import Mismatch
 
 EQUIPPED: Final = ("regression_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
 PUBLISHED: Final = tuple(f"{name}:published" for name in EQUIPPED[1:])
-REFERENCES: Final = ("calibrated", "nmpc_calibrated")
+REFERENCES: Final = ("calibrated",)  # which bounds the scores; nmpc_calibrated takes most of the time of a suite
 HIDDEN: Final = (
     Challenge("moves", task="random", measure="settling", reference=REFERENCES),
     Challenge("circle", task="circle", measure="path", reference=REFERENCES),
@@ -99,7 +100,7 @@ def sections(settings: dict[str, Any], task: str) -> dict[str, Any]:
 def identified(plant: Hidden, truth: str, seed: int) -> tuple[str, str]:
     """Return the line on a log of a plant, and the file of its twin, empty for a log that is refused."""
     settings = {key: value for key, value in plant.settings.items() if not key.startswith("task.")}
-    given = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25}, **sections(settings, "random")}
+    given = {"random": {"duration": 60.0}, "Excite": {"swing": 0.25, "fastest": 0.5}, **sections(settings, "random")}
     given["run"] = given.get("run", {}) | {"lost_after": 20.0}
     made = servobench.run(
         "docs/examples/excite.py", PLANT, task="random", mismatch=str(plant.words), robot=truth, seed=seed,
@@ -220,7 +221,11 @@ def main() -> None:
     given = parser.parse_args()
     names = challenge_names() if given.challenges == "all" else given.challenges.split(",") if given.challenges else ()
     chosen = [find_challenge(name) for name in names]
-    chosen = [each for each in chosen if given.challenges != "all" or each.grade.name in ("II", "III")] or HIDDEN
+    chosen = [
+        replace(each, reference=REFERENCES)
+        for each in chosen
+        if given.challenges != "all" or each.grade.name in ("II", "III")
+    ] or HIDDEN
     methods = [*EQUIPPED, *PUBLISHED] if given.methods == "all" else given.methods.split(",")
     tables = []
     for challenge in chosen:

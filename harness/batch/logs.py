@@ -25,6 +25,10 @@ CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plan
 TASK: Final = "circle"  # likewise, without effect
 
 
+class UnevenRows(ConfigurationError):
+    """Rows of a log that are missing, doubled or out of order."""
+
+
 def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
     """Return the row of a run of a results folder; without a name the only one.
 
@@ -119,7 +123,7 @@ def _period(path: Path, table: pd.DataFrame) -> float:
     late = np.abs(times - times[0] - period * np.arange(len(times))) > TIME_TOLERANCE
     if late.any():
         row = int(late.argmax())
-        raise ConfigurationError(
+        raise UnevenRows(
             f"log {path}: row {row} is {steps[row - 1]:g} s after the row before, and rows must be the control period "
             f"of {period:g} s apart: sort them, leave out doubled ones, or resample the log at equal steps"
         )

@@ -172,6 +172,7 @@ def identify(
 
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """
+    from servobench.harness.batch.logs import UnevenRows
     from servobench.harness.run.experiment import build
     from servobench.harness.run.identification import command_response, read_log
     from servobench.harness.run.preflight import mistakes
@@ -179,7 +180,11 @@ def identify(
     from servobench.harness.run.twin_file import estimates, remarks, twin_text
     from servobench.plant.robot.catalogue import ROBOTS, find_robot
 
-    resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+    try:
+        resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
+    except UnevenRows as error:
+        say(str(error))
+        sys.exit(FAILED)
     request = resolved.request
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)

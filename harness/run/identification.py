@@ -11,12 +11,14 @@ that directions of θ that no frame tells (the zero of the first joint turns the
 at the nominal robot. The posterior is N(θ, c (JᵀΣ⁻¹J/f + S⁻²)⁻¹), where f is the correlation time of the residuals.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.interpolate import CubicSpline
 
 from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
 from servobench.plant.contract.checks import FloatArray
@@ -24,7 +26,8 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
 from servobench.plant.robot.hand_eye import RobotModel
-from servobench.plant.robot.twin import LENS, deviated, parameter_names
+from servobench.plant.robot.mechanics import MechanicsConfig
+from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
 MAX_LATENCY: Final = 0.25  # [s]
 LATENCY_STEP: Final = 0.0125  # [s] of the first search
@@ -33,8 +36,16 @@ MIN_FRAMES: Final = 50
 MAX_FRAMES: Final = 6000
 PRIORS: Final = {  # standard deviations by the begin of a parameter's name
     "latency": 0.1, "camera_turn": 1.0, "camera": 1.0, "tool": 0.05, "focal": 0.1, "centre": 20.0, "distortion": 0.2,
-    "gear": 0.1, "zero": 0.2, "link": 0.1,
+    "gear": 0.1, "zero": 0.2, "link": 0.1, "backlash": 0.02, "ripple": 0.05, "compliance": 0.01, "turning": 0.2,
+    "swing": 0.1, "drift": 0.01,
 }  # fmt: skip
+# The last two are those of places.
+EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
+TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
+SWINGS: Final = np.geomspace(1.0, 20.0, 120)  # [s] periods of the search
+SWINGS_IN_LOG: Final = 3  # at least
+RIPPLE_ORDER: Final = MechanicsConfig().ripple_order
+MIN_PLAY: Final = 0.002  # [rad] about which the effect of play is linear
 TOLD: Final = 1.2  # [1] growth of a deviation with a prior of twice the width, below which the log tells a parameter
 TOLD_SHARE: Final = 0.5  # [1] of its prior deviation, below which a direction is drawn from
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
@@ -95,11 +106,17 @@ class Identified:
     rows: Any  # of these frames in the log, (k,)
     inliers: BoolArray  # which of them are no outliers, (k,)
     correlation: float  # f [frames]
+    swing_period: float  # [s]
 
     @property
     def deviations(self) -> FloatArray:
         """Standard deviations of the parameters, (p,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def estimate(self, name: str) -> tuple[float, float]:
+        """Return a parameter and its standard deviation; 0 and infinite for one that the log does not have."""
+        where = [k for k, own in enumerate(self.names) if own == name]
+        return next(((float(self.values[k]), float(self.deviations[k])) for k in where), (0.0, np.inf))
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
@@ -134,28 +151,40 @@ def prior(name: str) -> float:
 class _Problem:
     """Residuals of the valid frames of a log as a function of z = θ / s."""
 
-    def __init__(self, log: Log, model: RobotModel, most: int) -> None:
+    def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
         self.rows = frames_of(log)
         self.rows = self.rows[:: -(-len(self.rows) // most)]
         self.time, self.y = log.time[self.rows], log.features[self.rows]
-        self.motion = motion(log)
-        lens: tuple[str, ...] = () if isinstance(model, SetupModel) and model.setup.name == PIXEL.name else LENS
+        self.motion, self.log, self.middle = motion(log), log, float(log.time.mean())
+        pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
+        lens: tuple[str, ...] = () if pixels else LENS
         self.names = tuple(each for each in parameter_names(model.arm) if each not in ("command_delay", "lag", *lens))
+        self.names += EXTRAS[:5] if pixels else EXTRAS
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
-        self.model, self.latency, self.spread = self._placed(model)
+        self.z, self.pace = np.zeros(len(self.names)), 1.0
+        self.set(**begin)
+        self.model, model = model, deviated(model, begin)
+        tried = [self._placed(model, latency, 0.0) for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)]
+        if not pixels:
+            tried += [self._placed(model, min(tried)[1], turning) for turning in TURNINGS]
+        self.spread, latency, turning, pose = min(tried)
+        self.set(latency=latency, turning=turning)
+        self.model = self.model.with_camera(np.array(pose))
 
-    def _placed(self, model: RobotModel) -> tuple[RobotModel, float, float]:
-        """Return a model whose camera is where it fits best, the latency of this fit, and its median error."""
-        tried = []
-        for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP):
-            pose = camera_pose(model, self.motion(self.time - latency), self.y)
-            placed = model.with_camera(pose)
-            error = np.asarray(placed.feature(self.motion(self.time - latency))) - self.y
-            tried.append((float(np.median(np.linalg.norm(error, axis=1))), float(latency), placed))
-        spread, latency, placed = min(tried, key=lambda each: each[0])
-        return placed, latency, spread
+    def _placed(self, model: RobotModel, latency: float, turning: float) -> tuple[float, float, float, Any]:
+        """Return the median error at a latency and a speed of turning, both, and the pose that fits best."""
+        q = self.motion(self.time - latency)
+        y = turned(self.y, -turning * (self.time - latency)) if turning else self.y
+        pose = camera_pose(model, q, y)
+        error = np.asarray(model.with_camera(pose).feature(q)) - y
+        return float(np.median(np.linalg.norm(error, axis=1))), float(latency), float(turning), pose.tolist()
+
+    def set(self, **values: float) -> None:
+        """Change θ where the search of a fit begins, by name; a name that is no parameter of the log is left out."""
+        for name, value in values.items():
+            self.z[[each == name for each in self.names]] = value / prior(name)
 
     def values(self, z: FloatArray) -> dict[str, float]:
         """Return θ by name."""
@@ -164,8 +193,18 @@ class _Problem:
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
-        q = self.motion(self.time - values["latency"])
-        return np.asarray(self.y - np.asarray(deviated(self.model, values).feature(q)))
+        steady = values["latency"] + values["drift"] * (self.time - self.middle)
+        late = steady
+        for _ in range(3):  # the swing is that at the exposure
+            phase = self.pace * (self.time - late)
+            late = steady + values["swing_sin"] * np.sin(phase) + values["swing_cos"] * np.cos(phase)
+        time = self.time - late
+        q = self.motion(time)
+        q = q + values["ripple"] * np.sin(RIPPLE_ORDER * q) + values["backlash"] * self.play(time)
+        y = np.asarray(deviated(self.model, values).feature(q))
+        if "turning" in values:
+            y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
+        return np.asarray(self.y - y)
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
         """Return residuals with their weights (k,) and Σ^{-1/2}, and z for its prior."""
@@ -177,8 +216,30 @@ class _Problem:
 
     def recentred(self, z: FloatArray) -> FloatArray:
         """Take the pose of the camera for that from which it deviates, and return the z that is left."""
-        self.model = self.model.with_camera(self.pose(z))
+        self.model, values = self.model.with_camera(self.pose(z)), self.values(z)
+        size = max(abs(values["backlash"]), MIN_PLAY)
+        gears = self.log.joints + values["ripple"] * np.sin(RIPPLE_ORDER * self.log.joints)
+        self.play = CubicSpline(self.log.time, played(gears, size) / size)
+        rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
+        self.pull = CubicSpline(self.log.time, rigid.feature(self.log.joints)).derivative(2)
         return np.asarray(z * ~self._of_camera)
+
+    def swung(self, z: FloatArray) -> FloatArray:
+        """Take the period with which the latency swings most likely, and return the z with the sizes there."""
+        swings, step = [name.startswith("swing") for name in self.names], 0.01 * (np.array(self.names) == "latency")
+        error = self.errors(z := np.where(swings, 0.0, z))
+        rates = (self.errors(z + step) - error) / (0.01 * prior("latency"))
+        weight = np.sum(rates**2, axis=1) + 1e-12
+        late = -np.sum(rates * error, axis=1) / weight
+        weight = np.sqrt(weight / (1.0 + (late / np.median(np.abs(late))) ** 2))
+        found: list[tuple[float, float, list[float]]] = []
+        for pace in 2.0 * np.pi / SWINGS[np.ptp(self.time) > SWINGS_IN_LOG * SWINGS]:
+            waves = np.stack([np.sin(pace * self.time), np.cos(pace * self.time)], axis=1) * weight[:, None]
+            sizes = np.linalg.lstsq(waves, late * weight, rcond=None)[0]
+            found.append((float(np.sum((late * weight - waves @ sizes) ** 2)), pace, sizes.tolist()))
+        _, self.pace, sizes = min(found, default=(0.0, self.pace, [0.0, 0.0]))
+        z[swings] = np.array(sizes) / prior("swing")
+        return z
 
     def differences(self, z: FloatArray) -> FloatArray:
         """Return θ, for the camera the difference from its nominal pose in the same form."""
@@ -189,11 +250,18 @@ class _Problem:
         values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
         return values
 
-    def start(self) -> FloatArray:
-        """Return the z of the first search."""
-        z = np.zeros(len(self.names))
-        z[self.names.index("latency")] = self.latency / prior("latency")
-        return z
+
+def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
+    """Return places (k, 3) as a camera sees them that is turned about its optical axis by angles (k,) [rad]."""
+    (x, y, depth), c, s = places.T, np.cos(angle), np.sin(angle)
+    return np.stack([c * x + s * y, c * y - s * x, depth], axis=1)
+
+
+def played(joints: FloatArray, size: float) -> FloatArray:
+    """Return by how much joints (k, n) behind gears with a play of ±size are elsewhere, (k, n) [rad]."""
+    mechanics, x = MechanicsConfig(backlash=size), joints[0]
+    behind = np.array([x := mechanics.driven(x, q) for q in joints])
+    return behind - joints
 
 
 def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> FloatArray:
@@ -228,7 +296,9 @@ def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> 
     return pose
 
 
-def identify(log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FITS) -> Identified:
+def identify(
+    log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FITS, begin: Mapping[str, float] | None = None
+) -> Identified:
     """Identify a robot from a log.
 
     Args:
@@ -236,6 +306,7 @@ def identify(log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FI
         model: nominal robot under the sensing of the log, position or pixel.
         most: frames that are used, at equal distances.
         fits: number of fits, the last without a robust loss.
+        begin: parameters by name, with which the search begins.
 
     Raises:
         ConfigurationError: another sensing.
@@ -247,11 +318,13 @@ def identify(log: Log, model: RobotModel, most: int = MAX_FRAMES, fits: int = FI
         raise ConfigurationError(
             f"identify takes logs with --sensing position or pixel, of a fixed camera; got {sensing}"
         )
-    problem = _Problem(log, model, most)
+    problem = _Problem(log, model, most, begin or {})
     inliers = np.ones(len(problem.rows), dtype=np.bool_)
-    noise, z = np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2, problem.start()
+    noise, z = np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2, problem.z
     for left in reversed(range(fits)):
         root, z = np.linalg.inv(np.linalg.cholesky(noise)), problem.recentred(z)
+        if left == 1:
+            z = problem.swung(z)
         distances = np.sum((problem.errors(z) @ root.T) ** 2, axis=1)
         weights = np.asarray((1.0 + distances) ** -0.25 if left else inliers, dtype=np.float64)
         solved: Any = least_squares(
@@ -288,6 +361,7 @@ def _posterior(
         rows=problem.rows,
         inliers=inliers,
         correlation=correlation,
+        swing_period=2.0 * np.pi / problem.pace,
     )
 
 

@@ -6,7 +6,7 @@ each mistake is undone in turn, and named where the log is explained far better 
 
 import math
 from collections.abc import Iterator, Mapping
-from itertools import combinations
+from itertools import combinations, product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,7 +19,6 @@ from servobench.harness.run.identification import (
     camera_pose,
     frames_of,
     identify,
-    motion,
     prior,
 )
 from servobench.plant.contract.checks import FloatArray
@@ -35,9 +34,10 @@ GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
 SCREENED: Final = 6  # mistakes that are looked at closely
 FRAMES: Final = 150  # frames of a close look
-DRIFT: Final = 0.01  # [s] over the log, from which a clock counts as drifting
+DRIFT: Final = 10.0  # [ms] over the log, from which a clock counts as drifting
 CERTAIN: Final = 6.0  # [1] standard deviations
-DRIFT_STEPS: Final = 4  # Newton's
+SEARCHES: Final = 5  # of joint zeros
+ANGLES: Final = np.radians([-120, -90, -60, -30, 30, 60, 90, 120, 180, -10, 10]).tolist()
 PARTS: Final = 16  # of the log, between which the camera may have moved
 JUMP: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
 
@@ -62,11 +62,14 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
     if found:
         return found, None
     robot = identify(log, model)
-    drift, deviation = _drift(log, robot)
-    drifts = abs(drift) > max(CERTAIN * deviation, DRIFT / float(np.ptp(log.time)))
-    if is_explained(log, robot) and not drifts:
-        return "", robot
-    found = _moved(log, model) or _undone(log, model, others)
+    if not _is_noise(log, robot):
+        if found := _moved(log, model):
+            return found, None
+        other = identify(log, model, begin=_zeros(log, model))
+        robot = other if _is_noise(log, other) else robot
+    found = _drift(log, robot)
+    if not is_explained(log, robot):
+        found = _undone(log, model, others, only_likely=_is_noise(log, robot)) or found
     return found, None if found else robot
 
 
@@ -88,10 +91,35 @@ def _sizes(robot: Identified) -> FloatArray:
 
 def is_explained(log: Log, robot: Identified) -> bool:
     """Return whether residuals are not far above the noise, and no parameter is unlikely."""
+    return _is_noise(log, robot) and bool(np.abs(_sizes(robot)).max() < UNLIKELY)
+
+
+def _is_noise(log: Log, robot: Identified) -> bool:
     spread = np.sqrt(np.diag(robot.noise))
     size = np.std(log.features[robot.rows], axis=0).max()
     rest = (spread > UNEXPLAINED * noise_of(log)) & (spread > MIN_SHARE * size)
-    return bool(not rest.any() and np.abs(_sizes(robot)).max() < UNLIKELY and robot.inliers.mean() > 0.5)
+    return bool(not rest.any() and robot.inliers.mean() > 0.5)
+
+
+def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
+    """Return zeros of the joints, by a search along one after the other with the camera where it fits."""
+    rows, draws = frames_of(log), np.random.default_rng(0)
+    rows = rows[:: -(-len(rows) // FRAMES)]
+    q, y, n = log.joints[rows], log.features[rows], log.spec.n
+    found: list[tuple[float, list[float]]] = []
+    for _ in range(SEARCHES):
+        best, zeros, before = np.inf, draws.uniform(-math.pi, math.pi, n), np.inf
+        while best < before or before == np.inf:
+            before = best
+            for joint, angle in product(range(1, n - 1), ANGLES):  # the first and the last one turn camera and ball
+                other = np.where(np.arange(n) == joint, (zeros + angle) % (2.0 * math.pi), zeros)
+                placed = model.with_camera(camera_pose(model, q + other, y))
+                if (
+                    error := float(np.median(np.linalg.norm(np.asarray(placed.feature(q + other)) - y, axis=1)))
+                ) < best:
+                    best, zeros = error, other
+        found.append((best, ((zeros + math.pi) % (2.0 * math.pi) - math.pi).tolist()))
+    return {f"zero_{name}": zero for name, zero in zip(log.spec.joint_names, min(found)[1], strict=True)}
 
 
 def _units(log: Log, model: RobotModel) -> str:
@@ -131,27 +159,14 @@ def _repeats(log: Log) -> str:
     )
 
 
-def _drift(log: Log, robot: Identified) -> tuple[float, float]:
-    """Return by how much frames come later per second of the log [1], and its standard deviation."""
-    rows, kept = robot.rows, robot.inliers
-    rates = np.gradient(log.features[rows] - robot.residuals, log.time[rows], axis=0)[kept]
-    root = np.linalg.inv(np.linalg.cholesky(robot.noise))
-    since = log.time[rows][kept] - log.time.mean()
-    pull, error = -(rates @ root.T) * since[:, None], robot.residuals[kept] @ root.T
-    weight = float(np.sum(pull**2)) + 1e-12
-    return float(np.sum(pull * error)) / weight, math.sqrt(robot.correlation / weight)
-
-
-def _undrifted(log: Log, model: RobotModel) -> _Remedy:
-    """Return the log with the clock of the joints stretched such that frames are late by a constant."""
-    total, undone = 0.0, log
-    for _ in range(DRIFT_STEPS):
-        total += _drift(undone, identify(undone, model, FRAMES, fits=2))[0]
-        limits = log.time[0], log.time[-1]
-        undone = log._replace(joints=motion(log)(np.clip(log.time - total * (log.time - log.time.mean()), *limits)))
-    word = f"{1e3 * abs(total) * float(np.ptp(log.time)):.0f} ms {'later' if total > 0.0 else 'earlier'}"
-    text = f"frames come {word} at the end than at the begin, as clocks of camera and joints drift: stamp both with one"
-    return _Remedy(text, undone, model)
+def _drift(log: Log, robot: Identified) -> str:
+    """Name clocks of which one gains on the other."""
+    drift, deviation = robot.estimate("drift")
+    total = 1e3 * float(np.ptp(log.time))  # [ms]
+    if abs(drift) < max(CERTAIN * deviation, DRIFT / total):
+        return ""
+    word = f"{abs(drift) * total:.0f} ± {1.96 * deviation * total:.1g} ms {'later' if drift > 0.0 else 'earlier'}"
+    return f"frames come {word} at the end than at the begin, as clocks of camera and joints drift: stamp both with one"
 
 
 def _moved(log: Log, model: RobotModel) -> str:
@@ -174,8 +189,11 @@ def _moved(log: Log, model: RobotModel) -> str:
     return ""
 
 
-def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> str:
-    """Return the mistake without which the log is explained far better, with those that cannot be told from it."""
+def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], *, only_likely: bool) -> str:
+    """Return the mistake without which the log is explained far better, with those that cannot be told from it.
+
+    Of a log that is explained by unlikely parameters only a mistake that leaves likely ones is one.
+    """
     rows = frames_of(log)
     rows = rows[:: -(-len(rows) // FRAMES)]
     noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
@@ -187,10 +205,12 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> st
 
     def misfit(each: _Remedy) -> float:
         robot = identify(each.log, each.model, FRAMES, fits=2)
+        if only_likely and np.abs(_sizes(robot)).max() > UNLIKELY:
+            return np.inf
         error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
         return float(error.sum() + np.sum(_sizes(robot) ** 2))
 
-    tried = [*sorted(_remedies(log, model, others), key=quick)[:SCREENED], _undrifted(log, model)]
+    tried = sorted(_remedies(log, model, others), key=quick)[:SCREENED]
     as_it_is, misfits = misfit(_Remedy("", log, model)), [misfit(each) for each in tried]
     best = min(misfits)
     if best >= GAIN * as_it_is:

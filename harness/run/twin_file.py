@@ -1,13 +1,15 @@
 """Identified robots in words: tables of estimates, remarks on a log, and the file of a twin."""
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from servobench.harness.config.description import toml
-from servobench.harness.run.identification import Identified, Log, Response, kind_of, prior
+from servobench.harness.run.identification import EXTRAS, OUTLIER, Identified, Log, Response, kind_of, prior
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import TIMES
 
 MIN_DEVIATION: Final = 1e-4  # [s] of delay and lag, as they are printed
@@ -15,6 +17,13 @@ STILL: Final = 0.05  # [rad] of motion, below which a joint hardly moves
 MAX_UNEXPLAINED: Final = 0.1  # [1] share of the joint motion that a lag of first order may leave
 SHOWN: Final = 0.05  # [1] of the largest entry of a direction, from which a parameter is named
 WHITE: Final = 3.0  # [1] deviations of a correlation from none, up to which residuals count as white
+CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft tool and the like
+MIN_LATE: Final = 0.02  # [s] by which frames must be late by changing times
+MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
+FAR: Final = 3.0  # [1] prior deviations
+SLOW: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
+BURST: Final = 2.0  # [1] lost frames in a row over those of independent losses
+JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
 UNITS: Final = {  # of parameters as they are printed, by the begin of their names, and how many are one of their own
     "latency": ("ms", 1e3), "camera_turn": ("°", 180.0 / math.pi), "camera": ("mm", 1e3), "tool": ("mm", 1e3),
     "focal": ("%", 1e2), "centre": ("px", 1.0), "distortion": ("", 1.0), "gear": ("%", 1e2),
@@ -29,8 +38,8 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
         for name, value, deviation in zip(TIMES[1:], response[:2], np.sqrt(np.diag(response.covariance)), strict=True)
     ]  # fmt: skip
     for name, value, deviation, told in zip(robot.names, robot.values, robot.deviations, robot.told, strict=True):
-        unit, per = UNITS[kind_of(name)]
-        rows += [(name, per * value, per * deviation, unit)] if told else []
+        unit, per = UNITS.get(kind_of(name), ("", 1.0))
+        rows += [(name, per * value, per * deviation, unit)] if told and name not in EXTRAS else []
     table = pd.DataFrame(rows, columns=["parameter", "estimate", "deviation", "unit"])
     digits = np.maximum(0, 1 - np.floor(np.log10(2.0 * table["deviation"]))).astype(int)
     table["± 95 %"] = [f"{1.96 * each:.{n}f}" for each, n in zip(table.pop("deviation"), digits, strict=True)]
@@ -58,9 +67,14 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
         lines.append(
             f"delay and lag leave {response.unexplained:.0%} of the joint motion: the drive is no first-order lag"
         )
+    for section, settings in sensor(log, robot).settings.items():
+        lines.append(f"{section}: {', '.join(f'{name} {value:.3g}' for name, value in settings.items())}")
+    sizes = zip(robot.names, np.abs(robot.values) / np.array([prior(name) for name in robot.names]), strict=True)
+    if far := [name for name, size in sizes if size > FAR and name.startswith(("gear", "zero", "link", "tool"))]:
+        lines.append(f"far from the nominal robot: {', '.join(far)}; is it this arm?")
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
     widest = max(
-        (name for name, told in zip(robot.names, robot.told, strict=True) if told),
+        (name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS),
         key=lambda name: robot.deviations[robot.names.index(name)] / prior(name),
     )
     duration = float(np.ptp(log.time))
@@ -87,8 +101,8 @@ def unexplained(log: Log, robot: Identified) -> tuple[float, float]:
 
 
 def frame_period(log: Log) -> float:
-    """Return the usual distance of valid frames [s]."""
-    return log.spec.period * float(np.median(np.diff(np.flatnonzero(log.valid))))
+    """Return the distance of frames of which some may be missing [s]."""
+    return log.spec.period * float(np.gcd.reduce(np.diff(np.flatnonzero(log.valid))))
 
 
 def lost_share(log: Log) -> float:
@@ -111,6 +125,91 @@ def untold_combinations(robot: Identified) -> list[str]:
     return texts
 
 
+class Sensor(NamedTuple):
+    """How camera, gears and tool deviate from steady and rigid ones, as a log tells."""
+
+    latency: float  # [s]
+    noise: FloatArray  # Σ, (m, m)
+    outliers: BoolArray  # which of the frames, (k,)
+    lost: float  # [1] share of the frames
+    settings: dict[str, dict[str, float]]  # of a plant, by section
+
+
+def sensor(log: Log, robot: Identified) -> Sensor:
+    """Return what a log tells of sensor and mechanics.
+
+    Frames late by times of deviation σ leave residuals with E‖e‖² = tr Σ + σ² ‖ẏ‖² of a feature that moves at ẏ.
+    """
+    found = {name: value for name, (value, deviation) in ((name, robot.estimate(name)) for name in EXTRAS)
+             if abs(value) > CERTAIN * deviation}  # fmt: skip
+    mechanics: dict[str, float] = {name: abs(found[name]) for name in ("backlash", "ripple") if name in found}
+    if found.get("compliance", 0.0) > 0.0:
+        mechanics["tool_frequency"] = found["compliance"] ** -0.5
+    sensing = {"camera_turn": found["turning"]} if found.get("turning", 0.0) > 0.0 else {}
+    swing, noise, outliers = (
+        math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0)),
+        robot.noise,
+        ~robot.inliers,
+    )
+    spread, steady, kept = _lateness(log, robot)
+    lost, gap, waiting = lost_share(log), usual_gap(log), Waiting(0.0, 0.0, 0.0)
+    if swing > MIN_LATE:
+        sensing |= {"latency_swing": swing, "swing_period": robot.swing_period}
+        waiting = arrivals(log.spec.period, 0.0, swing, robot.swing_period)
+    elif spread > MIN_LATE:
+        tried = [(arrivals(log.spec.period, jitter), jitter) for jitter in JITTERS]
+        waiting, sensing["jitter"] = min(tried, key=lambda each: abs(each[0].deviation - spread))
+    elif gap * (1.0 - lost) > BURST:
+        sensing |= {"occlusions": lost, "occlusion_duration": gap * frame_period(log)}
+        lost = 0.0
+    if waiting.mean:
+        noise, outliers, lost = steady, ~kept, max(0.0, lost - waiting.missing)
+    latency = max(0.0, robot.estimate("latency")[0] - waiting.mean)  # an estimate of 0 may fall below it
+    sections: dict[str, dict[str, float]] = {"sensing": sensing, "mechanics": mechanics}
+    return Sensor(latency, noise, outliers, lost, {name: own for name, own in sections.items() if own})
+
+
+def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray]:
+    """Return the certain part of σ [s], Σ by the slow frames, and which frames are no outliers."""
+    rates = np.gradient(log.features[robot.rows] - robot.residuals, log.time[robot.rows], axis=0)
+    speed, square = np.sum(rates**2, axis=1), np.sum(robot.residuals**2, axis=1)
+    slow = robot.inliers & (speed <= np.quantile(speed, SLOW))
+    usual = float(np.mean(square[slow]))
+    kept = square < OUTLIER * (usual / log.spec.m + MAX_SPREAD**2 * speed)
+    weight = kept / (usual + MAX_SPREAD**2 * speed)
+    apart = weight * (speed - np.average(speed, weights=weight))
+    size = float(apart @ speed) + 1e-12
+    slope = float(apart @ square) / size
+    left = square - slope * speed
+    deviation = float(np.linalg.norm(apart * (left - np.average(left, weights=weight)))) / size
+    share = max(float(np.mean(left[slow])) / usual, 0.1)
+    return (slope**0.5 if slope > CERTAIN * deviation else 0.0), share * np.cov(robot.residuals[slow].T), kept
+
+
+class Waiting(NamedTuple):
+    """The time from exposure to the control instant that follows the delivery, in frames of a latency that changes."""
+
+    mean: float  # [s]
+    deviation: float  # [s]
+    missing: float  # [1] share of the periods without a new frame
+
+
+def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: float = 1.0) -> Waiting:
+    """Return the times of frames that are late by A (1 + sin(2π t/P)) + U(0, jitter), as the bench delivers them."""
+    instants = np.arange(4000.0)
+    late = swing * (1.0 + np.sin(2.0 * np.pi * period * instants / swing_period))
+    late += jitter * np.random.default_rng(0).random(len(instants))
+    newest = np.searchsorted(np.maximum.accumulate(instants + late / period), instants, side="right") - 1
+    age = period * (instants - newest)[np.diff(newest, prepend=-1) > 0]
+    return Waiting(float(age.mean()), float(age.std()), 1.0 - len(age) / len(instants))
+
+
+def usual_gap(log: Log) -> float:
+    """Return how many frames are missing in a row where any is."""
+    missing = np.diff(np.flatnonzero(log.valid)) * log.spec.period / frame_period(log) - 1.0
+    return float(np.median(missing[missing > 0.5])) if (missing > 0.5).any() else 0.0
+
+
 def twin_text(robot: Identified, log: Log, response: Response | None, named: tuple[str, str]) -> str:
     """Return the file of a twin.
 
@@ -120,29 +219,26 @@ def twin_text(robot: Identified, log: Log, response: Response | None, named: tup
         response: to commands, if the log tells it.
         named: robot and sensing.
     """
-    mean = {name: value for name, value in zip(robot.names, robot.values.tolist(), strict=True)
+    own = [k for k, name in enumerate(robot.names) if name not in EXTRAS]
+    names, factor, told = [robot.names[k] for k in own], robot.factor[:, own], sensor(log, robot)
+    mean = {name: float(robot.values[k]) for name, k in zip(names, own, strict=True)
             if name != "latency" and not name.startswith("camera")}  # fmt: skip
-    names, factor = list(robot.names), robot.factor
     if response is not None:
         mean |= {"command_delay": response.delay, "lag": response.lag}
         values, vectors = np.linalg.eigh(response.covariance)
-        own = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        factor = np.block([[factor, np.zeros((len(factor), 2))], [np.zeros((2, len(names))), own]])
+        times = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        factor = np.block([[factor, np.zeros((len(factor), 2))], [np.zeros((2, len(names))), times]])
         names += TIMES[1:]
-    errors = robot.residuals[~robot.inliers]
-    top: dict[str, Any] = {
-        "robot": named[0],
-        "sensing": named[1],
-        "covariance": robot.noise,
-        "lost_frames": lost_share(log),
-    }
-    if len(errors):
-        size = float(np.sqrt(np.mean(errors**2)))
-        top |= {"outliers": 1.0 - float(robot.inliers.mean()), "outlier_size": size}
+    top: dict[str, Any] = {"robot": named[0], "sensing": named[1], "covariance": told.noise, "lost_frames": told.lost}
+    if told.outliers.any():
+        size = float(np.sqrt(np.mean(robot.residuals[told.outliers] ** 2)))
+        top |= {"outliers": float(told.outliers.mean()), "outlier_size": size}
     top |= {"parameters": names, "factor": factor}
     pose = f'{{ frame = "base", position = {toml(robot.pose[:3, 3])}, rotation = {toml(robot.pose[:3, :3])} }}'
-    latency = max(0.0, float(robot.values[robot.names.index("latency")]))  # an estimate of 0 may fall below it
-    camera = {"latency": latency, "rate": 1.0 / frame_period(log)}
+    sections = {"camera": {"latency": told.latency, "rate": 1.0 / frame_period(log)}, "mean": mean}
+    sections |= {f"plant.{name}": settings for name, settings in told.settings.items()}
     lines = [f"{key} = {toml(value)}" for key, value in top.items()]
-    lines += ["[camera]", *(f"{key} = {toml(value)}" for key, value in camera.items()), f"pose = {pose}"]
-    return "\n".join([*lines, "[mean]", *(f"{key} = {toml(value)}" for key, value in mean.items())]) + "\n"
+    for name, section in sections.items():
+        lines += [f"[{name}]", *(f"{key} = {toml(value)}" for key, value in section.items())]
+        lines += [f"pose = {pose}"] if name == "camera" else []
+    return "\n".join(lines) + "\n"

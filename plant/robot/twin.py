@@ -98,6 +98,8 @@ class TwinFile:
     """[1] share of the frames."""
     outlier_size: NonNegative = 0.0
     """[m or px] their usual distance."""
+    plant: dict[str, dict[str, Number]] = field(default_factory=dict)
+    """Further settings of sensing and mechanics, such as backlash."""
     mean: dict[str, Number] = field(default_factory=dict)
     """Parameters by name, but for those of the camera; one that is left out is 0."""
     parameters: tuple[str, ...] = ()
@@ -161,7 +163,8 @@ class Twin:
         if keys.camera.rate is not None and (rows := round(1.0 / (keys.camera.rate * period))) > 1:
             sensing["frame_period"] = rows * period  # else frames of any age arrive at control instants
         known = {each.name for each in fields(config)}
-        return {name: value for name, value in {**times, "sensing": sensing}.items() if name in known}
+        given = {**times, **keys.plant, "sensing": sensing | keys.plant.get("sensing", {})}
+        return {name: value for name, value in given.items() if name in known}
 
 
 def read_twin(path: Path, values: Mapping[str, Any], arm: SerialArm) -> Twin:

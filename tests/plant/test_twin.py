@@ -86,6 +86,12 @@ def test_frames_at_the_control_rate_are_as_late_as_the_log_says(tmp_path, rate, 
     assert resolve(request(robot), Settings()).plant.sensing.frame_period == frame_period
 
 
+def test_gears_and_sensor_of_a_twin_are_settings_of_its_plant(tmp_path):
+    robot = written(tmp_path, TWIN + "[plant.mechanics]\nbacklash = 0.01\n[plant.sensing]\njitter = 0.1\n")
+    plant = resolve(request(robot), Settings()).plant
+    assert (plant.mechanics.backlash, plant.sensing.jitter, plant.sensing.latency) == (0.01, 0.1, 0.083)
+
+
 def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
     drawn = {seed: resolve(request(twin, seed), Settings()).plant.sensing.latency for seed in range(6)}
     assert len(set(drawn.values())) > 3
