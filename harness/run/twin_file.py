@@ -73,12 +73,10 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
     if far := [name for name, size in sizes if size > FAR and name.startswith(("gear", "zero", "link", "tool"))]:
         lines.append(f"far from the nominal robot: {', '.join(far)}; is it this arm?")
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
-    widest = max(
-        (name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS),
-        key=lambda name: robot.deviations[robot.names.index(name)] / prior(name),
-    )
-    duration = float(np.ptp(log.time))
-    lines.append(f"{3.0 * duration:.0f} s more of such motion would halve the intervals; the widest is {widest}")
+    told = [name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS]
+    share, widest = max((robot.estimate(name)[1] / prior(name), name) for name in told)
+    longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)  # as the prior is no part of what a log tells
+    lines.append(f"at most {longer:.0f} s more of such motion would halve the widest interval, that of {widest}")
     return lines
 
 
@@ -143,16 +141,12 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     found = {name: value for name, (value, deviation) in ((name, robot.estimate(name)) for name in EXTRAS)
              if abs(value) > CERTAIN * deviation}  # fmt: skip
     mechanics: dict[str, float] = {name: abs(found[name]) for name in ("backlash", "ripple") if name in found}
-    if found.get("compliance", 0.0) > 0.0:
-        mechanics["tool_frequency"] = found["compliance"] ** -0.5
+    mechanics |= {"tool_frequency": found["compliance"] ** -0.5} if found.get("compliance", 0.0) > 0.0 else {}
     sensing = {"camera_turn": found["turning"]} if found.get("turning", 0.0) > 0.0 else {}
-    swing, noise, outliers = (
-        math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0)),
-        robot.noise,
-        ~robot.inliers,
-    )
+    swing = math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0))
     spread, steady, kept = _lateness(log, robot)
-    lost, gap, waiting = lost_share(log), usual_gap(log), Waiting(0.0, 0.0, 0.0)
+    noise, outliers, waiting = robot.noise, ~robot.inliers, Waiting(0.0, 0.0, 0.0)
+    lost, gap = lost_share(log), usual_gap(log)
     if swing > MIN_LATE:
         sensing |= {"latency_swing": swing, "swing_period": robot.swing_period}
         waiting = arrivals(log.spec.period, 0.0, swing, robot.swing_period)
@@ -174,7 +168,7 @@ def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray
     rates = np.gradient(log.features[robot.rows] - robot.residuals, log.time[robot.rows], axis=0)
     speed, square = np.sum(rates**2, axis=1), np.sum(robot.residuals**2, axis=1)
     slow = robot.inliers & (speed <= np.quantile(speed, SLOW))
-    usual = float(np.mean(square[slow]))
+    usual = float(np.mean(square[slow])) + 1e-18
     kept = square < OUTLIER * (usual / log.spec.m + MAX_SPREAD**2 * speed)
     weight = kept / (usual + MAX_SPREAD**2 * speed)
     apart = weight * (speed - np.average(speed, weights=weight))
