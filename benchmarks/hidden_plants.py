@@ -53,13 +53,14 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     """Identify one hidden plant, and return a row a parameter."""
     robot, mismatch, sections = draw_hidden(seed, plant)
     latency, delay = sections["sensing"]["latency"], sections["command_delay"]
-    settings = {plant: sections, "random": {"duration": 60.0}, "Excite": {"swing": 0.25}}
+    task, reach = ("random", np.inf) if plant == "kinematic" else ("target", 0.15)  # engines have a table
+    settings = {plant: sections, task: {"duration": 60.0}, "Excite": {"swing": 0.25, "reach": reach}}
     chosen: dict[str, Any] = {"robot": robot, "mismatch": mismatch, "seed": seed}
-    made = servobench.run("docs/examples/excite.py", plant, task="random", settings=settings, **chosen)
+    made = servobench.run("docs/examples/excite.py", plant, task=task, settings=settings, **chosen)
     about: dict[str, Any] = {"seed": seed, "robot": robot, "mismatch": mismatch, "rows": len(made.steps)}
     if made.row["status"] != "completed":
         return [about | {"parameter": "", "said": f"the run ended: {made.row['reason']}"}]
-    request = RunRequest(plant, "constant", "random", read_mismatch(mismatch), seed, robot=robot)
+    request = RunRequest(plant, "constant", task, read_mismatch(mismatch), seed, robot=robot)
     experiment = build(resolve(request, Settings(settings | {})))
     log, nominal = read_log(experiment.plant.spec, made.steps), find_sensing("position").nominal(find_robot(robot))
     experiment.plant.close()

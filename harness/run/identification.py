@@ -195,7 +195,7 @@ class _Problem:
         values = self.values(z)
         steady = values["latency"] + values["drift"] * (self.time - self.middle)
         late = steady
-        for _ in range(3):  # the swing is that at the exposure
+        for _ in range(8):  # the swing is that at the exposure
             phase = self.pace * (self.time - late)
             late = steady + values["swing_sin"] * np.sin(phase) + values["swing_cos"] * np.cos(phase)
         time = self.time - late
@@ -416,6 +416,8 @@ def command_response(log: Log) -> Response | None:
     left = solved.fun.reshape(-1, spec.n)
     variance = float(np.mean(left**2)) * correlation_time(left) + 1e-16
     covariance = variance * np.linalg.pinv(solved.jac.T @ solved.jac)
+    # What is left of a drive that is no first-order lag may be one of the delay, which the lag makes up for.
+    covariance += 0.25 * np.mean(left**2) / np.mean(solved.jac[:, 0] ** 2) * np.array([[1.0, -1.0], [-1.0, 1.0]])
     share = float(np.sqrt(np.mean(left**2) / np.mean(steps[first:] ** 2)))
     return Response(float(solved.x[0]), float(solved.x[1]), covariance, share)
 

@@ -109,6 +109,17 @@ def test_delay_and_lag_are_those_of_the_drive():
     assert command_response(log._replace(commands=None)) is None
 
 
+def test_a_drive_that_is_no_first_order_lag_widens_the_interval_of_the_delay():
+    """Joints that stick at slow speed move in steps, which no lag has."""
+    log = logged()[0]
+    stuck = log._replace(joints=0.01 * np.round(log.joints / 0.01))
+    exact, response = command_response(log), command_response(stuck)
+    deviation = float(np.sqrt(response.covariance[0, 0]))
+    assert np.sqrt(exact.covariance[0, 0]) < 1e-6 < 0.002 < deviation
+    assert abs(response.delay - DELAY) < 1.96 * deviation
+    assert response.covariance[0, 0] + response.covariance[0, 1] < 0.1 * response.covariance[0, 0]
+
+
 def test_joint_steps_are_the_integral_of_the_lag():
     period, delay, lag, fine = 0.05, 0.07, 0.11, 1000
     u = np.array([[1.0], [0.0], [-2.0], [0.5], [0.0], [0.0]])
