@@ -143,8 +143,8 @@ def said(log: Logged, folder: Path) -> str:
     return mistakes(read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * np.pi), log.table), model, others)[0]
 
 
-def planted(seed: int, folder: Path) -> list[dict[str, Any]]:
-    """Return a row for each mistake in a log, and for each pair."""
+def planted(seed: int, folder: Path, pairs: int) -> list[dict[str, Any]]:
+    """Return a row for each mistake in a log, and for so many pairs, drawn by the seed."""
     clean, rows = logged(seed), []
     names = [name for name in MISTAKES if name != "another arm" or TWINS[clean.robot] != clean.robot]
     alone = {}
@@ -152,7 +152,8 @@ def planted(seed: int, folder: Path) -> list[dict[str, Any]]:
         line = said(MISTAKES[name][0](clean), folder)
         alone[name] = MISTAKES[name][1] in line
         rows.append({"seed": seed, "first": name, "second": "", "named": alone[name], "line": line})
-    for first, second in combinations(names, 2):
+    drawn = np.random.default_rng(seed).permutation(list(combinations(names, 2)))[:pairs]
+    for first, second in drawn.tolist():
         line = said(MISTAKES[second][0](MISTAKES[first][0](clean)), folder)
         one, other = (MISTAKES[name][1] in line for name in (first, second))
         named = (one and (other or alone[second])) or (other and alone[first])
@@ -164,6 +165,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--logs", type=int, default=0, help="in which mistakes are planted")
+    parser.add_argument("--pairs", type=int, default=66, help="of mistakes, in each of these logs")
     parser.add_argument("--clean", type=int, default=0, help="logs without a mistake")
     parser.add_argument("--first", type=int, default=81000)
     parser.add_argument("--out", type=Path, help="CSV file for a row a log")
@@ -172,7 +174,7 @@ def main() -> None:
         lines = [said(logged(seed), Path(folder)) for seed in range(given.first, given.first + given.clean)]
         rows = []
         for seed in range(given.first, given.first + given.logs):
-            rows += planted(seed, Path(folder))
+            rows += planted(seed, Path(folder), given.pairs)
             if given.out is not None:
                 pd.DataFrame(rows).to_csv(given.out, index=False)
     if lines:
@@ -182,8 +184,9 @@ def main() -> None:
         single = table[table["second"] == ""]
         print(single.groupby("first", sort=False)["named"].agg(["sum", "count"]).to_string())
         pairs = table[table["second"] != ""]
-        one, both = pairs["one"].mean(), pairs["named"].mean()
-        print(f"{len(pairs)} pairs: one or both named in {one:.1%}, and the other one after its remedy in {both:.1%}")
+        if len(pairs):
+            one, both = pairs["one"].mean(), pairs["named"].mean()
+            print(f"{len(pairs)} pairs: one named in {one:.1%}, and the other one after its remedy in {both:.1%}")
         missed = table[~table["named"].astype(bool)]
         print(missed[["seed", "first", "second", "line"]].to_string(max_colwidth=140))
 
