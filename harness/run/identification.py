@@ -164,7 +164,7 @@ class _Problem:
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.z, self.pace = np.zeros(len(self.names)), 1.0
-        self.set(**begin)
+        self.set(**{name: value for name, value in begin.items() if not name.startswith("camera")})
         self.model, model = model, deviated(model, begin)
         tried = [self._placed(model, latency, 0.0) for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)]
         if not pixels:

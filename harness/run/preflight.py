@@ -69,7 +69,8 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
         robot = other if _is_noise(log, other) else robot
     found = _drift(log, robot)
     if not is_explained(log, robot):
-        found = _undone(log, model, others, only_likely=_is_noise(log, robot)) or found
+        known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
+        found = _undone(log, model, others, known) or found
     return found, None if found else robot
 
 
@@ -189,10 +190,10 @@ def _moved(log: Log, model: RobotModel) -> str:
     return ""
 
 
-def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], *, only_likely: bool) -> str:
+def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known: Mapping[str, float]) -> str:
     """Return the mistake without which the log is explained far better, with those that cannot be told from it.
 
-    Of a log that is explained by unlikely parameters only a mistake that leaves likely ones is one.
+    Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
     rows = frames_of(log)
     rows = rows[:: -(-len(rows) // FRAMES)]
@@ -203,22 +204,22 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], *, on
         placed = each.model.with_camera(camera_pose(each.model, q, y))
         return float(np.median(np.linalg.norm(np.asarray(placed.feature(q)) - y, axis=1)))
 
-    def misfit(each: _Remedy) -> float:
-        robot = identify(each.log, each.model, FRAMES, fits=2)
-        if only_likely and np.abs(_sizes(robot)).max() > UNLIKELY:
+    def misfit(each: _Remedy, begin: Mapping[str, float] | None = None) -> float:
+        robot = identify(each.log, each.model, FRAMES, fits=2, begin=begin)
+        if known and begin is None and np.abs(_sizes(robot)).max() > UNLIKELY:
             return np.inf
         error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
         return float(error.sum() + np.sum(_sizes(robot) ** 2))
 
     tried = sorted(_remedies(log, model, others), key=quick)[:SCREENED]
-    as_it_is, misfits = misfit(_Remedy("", log, model)), [misfit(each) for each in tried]
+    as_it_is, misfits = misfit(_Remedy("", log, model), known), [misfit(each) for each in tried]
     best = min(misfits)
-    if best >= GAIN * as_it_is:
+    if best >= (TIE if known else GAIN) * as_it_is:
         return ""
     names = [each.text for _, each in sorted(zip(misfits, tried, strict=True), key=lambda pair: pair[0])]
     names = names[: sum(own <= TIE * best for own in misfits)]
     which = "; a log cannot tell which" if len(names) > 1 else ""
-    return f"{', or '.join(names)} (undone, {math.sqrt(best / as_it_is):.0%} of the error is left{which})"
+    return f"{', or '.join(names)} (undone, {math.sqrt(best / max(best, as_it_is)):.0%} of the error is left{which})"
 
 
 def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:

@@ -150,6 +150,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     if swing > MIN_LATE:
         sensing |= {"latency_swing": swing, "swing_period": robot.swing_period}
         waiting = arrivals(log.spec.period, 0.0, swing, robot.swing_period)
+        sensing["latency_swing"] *= swing / waiting.swing
     elif spread > MIN_LATE:
         tried = [(arrivals(log.spec.period, jitter), jitter) for jitter in JITTERS]
         waiting, sensing["jitter"] = min(tried, key=lambda each: abs(each[0].deviation - spread))
@@ -186,6 +187,7 @@ class Waiting(NamedTuple):
     mean: float  # [s]
     deviation: float  # [s]
     missing: float  # [1] share of the periods without a new frame
+    swing: float = 0.0  # [s] of a fit to the frames that are seen
 
 
 def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: float = 1.0) -> Waiting:
@@ -194,8 +196,11 @@ def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: flo
     late = swing * (1.0 + np.sin(2.0 * np.pi * period * instants / swing_period))
     late += jitter * np.random.default_rng(0).random(len(instants))
     newest = np.searchsorted(np.maximum.accumulate(instants + late / period), instants, side="right") - 1
-    age = period * (instants - newest)[np.diff(newest, prepend=-1) > 0]
-    return Waiting(float(age.mean()), float(age.std()), 1.0 - len(age) / len(instants))
+    new = np.diff(newest, prepend=-1) > 0
+    age = period * (instants - newest)[new]
+    wave = np.sin(2.0 * np.pi * period * newest[new] / swing_period)
+    size = float(np.cov(wave, age)[0, 1] / max(wave.var(), 1e-9))
+    return Waiting(float(age.mean()), float(age.std()), 1.0 - len(age) / len(instants), size)
 
 
 def usual_gap(log: Log) -> float:
