@@ -1,7 +1,8 @@
-"""The commands for a controller, a plant or a log of your own, `servobench new | check | shadow | identify`."""
+"""The commands for a controller, plant, log or robot of your own: `new | check | shadow | identify | serve`."""
 
 from __future__ import annotations
 
+import ipaddress
 import keyword
 import re
 import sys
@@ -13,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, named_option, option
+from servobench.harness.cli.options import CONTROLLER, PLANT, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
-from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically, write_csv
+from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
+from servobench.plant.contract.files import reason, write_atomically, write_csv
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -228,3 +229,42 @@ def _logged(
     if controller is None:
         raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
     return logged_in_file(log, controller, *named)
+
+
+def serve(
+    *,
+    plant: Annotated[str, option(PLANT, "The plant that is served.")] = "kinematic",
+    robot: options.RobotOption = "ur5e",
+    task: options.TaskOption = "exp2",
+    mismatch: options.MismatchOption = options.DEFAULT_MISMATCH,
+    sensing: options.SensingOption = "position",
+    seed: Annotated[int, option("INTEGER", "Seed of the plant.")] = 0,
+    overrides: options.Overrides,
+    address: Annotated[str, option("ADDRESS", "Of the network interface to listen on.")] = "127.0.0.1",
+    lockstep: Annotated[bool, switch("--lockstep", "Let the clock wait for the command of each period.")] = False,
+) -> None:
+    """Serve a plant on the ports of a UR.
+
+    For the client ur-rtde 1.6.5. Conformance with it is checked; nothing here makes a robot safe. Ctrl-C ends it.
+    """
+    import asyncio
+
+    from servobench.harness.run.loop import careful
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.tasks import choose_task
+    from servobench.harness.serve import server
+
+    with configuration_errors("--address: "):
+        ipaddress.ip_address(address)
+    names = selection.choose("plants", plant), "constant", choose_task(task)
+    request = RunRequest(*names, read_mismatch(mismatch), seed, robot=robot, sensing=sensing)
+
+    with careful():
+        with configuration_errors(f"plant {plant}: ", RunFault):
+            served = server.Server(request, overrides.settings(), say, lockstep=lockstep)
+        try:
+            asyncio.run(served.serve(address))
+        except OSError as error:
+            raise ConfigurationError(f"{address} cannot be served: {reason(error)}") from error
+        finally:
+            served.rollout.plant.close()

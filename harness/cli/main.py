@@ -31,7 +31,7 @@ BASH: Final = "complete_bash"
 WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, results.statistics, results.report, results.figures, record),
-    "Your own controller": (authoring.new, authoring.check, authoring.shadow, authoring.identify),
+    "Your own controller": (authoring.new, authoring.check, authoring.shadow, authoring.identify, authoring.serve),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
     "Studies": (studies.sweep, studies.analyse, studies.robustness, studies.suite, studies.claims, studies.tune),
     "Tools": (runs.train, results.collect, runs.merge, results.export, results.verify),

@@ -1,0 +1,1 @@
+"""A plant behind the sockets of a UR's controller, as far as one client needs them."""

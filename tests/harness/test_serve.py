@@ -1,0 +1,396 @@
+"""A plant on the ports of a UR: packets, the control program, lockstep, refusals, and bytes that make no sense.
+
+Here a client speaks bytes; tests/end_to_end/test_on_a_ur.py talks to the server by `ur-rtde` itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+import struct
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kit.command import servobench
+from kit.served import REQUEST, SPEED, Bytes, commanding, connected, packed, served, waited_for
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.serve.program import ControlProgram, profile, script_version
+from servobench.harness.serve.server import Server
+from servobench.harness.serve.wire import CONTROLLER, INPUTS, NOT_FOUND, OUTPUTS, Recipe, WireError
+from servobench.plant.bench.plant import TrueModel
+from servobench.plant.contract.faults import Collision, ConfigurationError
+from servobench.plant.contract.seeds import named_seed
+from servobench.plant.contract.signals import Command
+
+
+@pytest.fixture(scope="module")
+def lockstep():
+    with served() as running:
+        yield running
+
+
+def test_a_move_takes_the_time_of_a_trapezoid():
+    duration, done = profile(0.5, 0.8, 1.4)
+    assert duration == pytest.approx(0.5 / 0.8 + 0.8 / 1.4)
+    assert done(duration / 2.0) == pytest.approx(0.5)
+    assert done(0.1) == pytest.approx(1.4 * 0.1**2 / 2.0 / 0.5)
+    assert [done(0.0), done(-1.0), done(duration), done(9.0)] == [0.0, 0.0, 1.0, 1.0]
+
+
+def test_a_short_move_never_reaches_its_speed():
+    duration, done = profile(0.1, 5.0, 1.0)
+    assert duration == pytest.approx(2.0 * math.sqrt(0.1))
+    assert np.gradient([done(t) for t in np.linspace(0.0, duration, 101)], duration / 100).max() * 0.1 < 0.32
+
+
+def test_no_move_takes_no_time():
+    assert profile(0.0, 1.0, 1.0)[0] == 0.0
+
+
+@given(st.lists(st.sampled_from(sorted(INPUTS)), min_size=1, max_size=9, unique=True), st.data())
+def test_values_come_back_as_they_were_packed(names, data):
+    recipe = Recipe.of(",".join(names).encode(), INPUTS)
+    kinds = {
+        "INT32": st.integers(-(2**31), 2**31 - 1),
+        "UINT32": st.integers(0, 2**32 - 1),
+        "UINT8": st.integers(0, 255),
+        "DOUBLE": st.floats(allow_nan=False),
+        "VECTOR6D": st.tuples(*[st.floats(allow_nan=False)] * 6),
+    }
+    values = {name: data.draw(kinds[kind]) for name, kind in zip(names, recipe.types, strict=True)}
+    assert recipe.unpack(recipe.pack(values)) == values
+
+
+def test_a_list_without_names_is_no_recipe():
+    for body in (b"", b",,", b"\xff", b"a," * 1025):
+        with pytest.raises(WireError, match="a recipe must be 1 to 2048 bytes of names"):
+            Recipe.of(body, OUTPUTS)
+    assert Recipe.of(b"actual_q,nonsense,", OUTPUTS).types == ("VECTOR6D", NOT_FOUND)
+    assert Recipe.of(b"actual_q", INPUTS).types == (NOT_FOUND,)
+
+
+def test_a_commanded_period_is_that_of_a_run(lockstep):
+    server, address, _ = lockstep
+    experiment = build_experiment(REQUEST, Settings({}))
+    plant = experiment.plant
+    plant.reset(named_seed(REQUEST.seed, "plant"))
+    with commanding(server, address) as client:
+        client.names, rows = ["timestamp", "actual_q"], []
+        own = Bytes(address, "timestamp,actual_q")
+        own.start()
+        start = server.rollout.observation
+        for k in range(20):
+            speeds = [0.1 * math.sin(k + joint) for joint in range(6)]
+            client.command(9, *speeds, 1.0, 0.05)
+            before = server.rollout.k
+            expected = plant.step(Command(np.array(speeds)))
+            while True:
+                row = struct.unpack(">7d", own.packet()[1][1:])
+                if row[0] > start.time + (k + 0.5) * 0.05:
+                    break
+            rows.append((row[1:], expected.joint_position))
+            assert server.rollout.k <= before + 1
+        own.close()
+    for row, joints in rows:
+        assert np.array_equal(row, joints)
+    plant.close()
+
+
+def test_a_move_in_lockstep_ends_at_its_target():
+    with served() as (server, address, _), commanding(server, address) as client:
+        target = server.rollout.observation.joint_position + np.array([0.3, -0.1, 0.2, 0.0, 0.0, 0.1])
+        client.command(1, *target, 0.8, 1.4)
+        assert waited_for(lambda: server.program.progress == 2)
+        assert np.abs(server.rollout.observation.joint_position - target).max() < 3e-3
+        theory = 0.3 / 0.8 + 0.8 / 1.4
+        assert theory <= server.rollout.observation.time < theory + 0.5
+        client.command(0)
+        assert waited_for(lambda: server.program.progress == 1)
+
+
+def test_a_served_position_is_approached():
+    with served() as (server, address, _), commanding(server, address) as client:
+        names = ("input_int_register_0", *(f"input_double_register_{k}" for k in range(11)))
+        number, _ = client.set_up(*names)
+        target = server.rollout.observation.joint_position + 0.1
+        for k in range(40):
+            client.send(number, "i11d", 11, *target, 0.0, 0.0, 0.05, 0.1, 300.0)
+            assert waited_for(lambda k=k: server.rollout.k > k)
+        assert np.abs(server.rollout.observation.joint_position - target).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("number", "values", "said"),
+    [
+        (9, [math.nan] * 6 + [1.0, 0.1], "ended at speedJ: its numbers must be finite"),
+        (9, [0.1] * 6 + [0.0, 0.1], "ended at speedJ: its acceleration must be positive, got 0"),
+        (1, [99.0] * 6 + [1.0, 1.0], "ended at moveJ: its target must be within the joints' limits"),
+        (1, [0.5] * 6 + [1e-9, 1.0], "ended at moveJ: its move must take less than 300 s"),
+        (1, [0.5] * 6 + [5e-324, 5e-324], "ended at moveJ: its move must take less than 300 s"),
+        (3, [], "ended at moveL (command 3), which is not served"),
+        (10, [], "ended at speedL (command 10), which is not served"),
+        (66, [], "ended at directTorque (command 66), which is not served"),
+        (-7, [], "ended at - (command -7), which is not served"),
+    ],
+)
+def test_a_command_that_cannot_be_carried_out_ends_the_program_by_name_and_the_arm_stands(number, values, said):
+    with served() as (server, address, lines), commanding(server, address) as client:
+        client.command(9, *[0.2] * 6, 1.0, 0.05)
+        client.command(number, *values)
+        assert waited_for(lambda: any(said in line for line in lines)), lines
+        assert waited_for(lambda: not server.program.busy)
+        assert not server.program.running
+        assert not server.program.velocity.any()
+        assert server.program.progress == 0
+
+
+def test_an_asynchronous_move_is_refused():
+    with served() as (server, address, lines), commanding(server, address) as client:
+        number, _ = client.set_up(*SPEED, "input_int_register_1")
+        client.send(number, "i8di", 1, *[0.0] * 6, 1.0, 1.0, 1)
+        assert waited_for(lambda: any("asynchronous moves are not served" in line for line in lines))
+
+
+def test_speeds_are_clipped_as_in_a_run(lockstep):
+    server, address, _ = lockstep
+    with commanding(server, address) as client:
+        client.command(9, *[1e300, -1e300] * 3, 1.0, 0.05)
+        assert waited_for(lambda: np.abs(server.program.velocity).max() == 1.0)
+
+
+def program_of(spec, lines, **how):
+    drive = TrueModel(lambda q: q, lambda q: q, command_delay=0.05, lag=0.05)
+    program = ControlProgram(spec, drive, lines.append, **how)
+    program.joints = np.zeros(spec.n)
+    program.begin()
+    return program
+
+
+@pytest.fixture(scope="module")
+def spec():
+    experiment = build_experiment(REQUEST, Settings({"run": {"period": 0.002}}))
+    yield experiment.plant.spec
+    experiment.plant.close()
+
+
+def registers(command, *values):
+    return {"input_int_register_0": command} | {f"input_double_register_{k}": each for k, each in enumerate(values)}
+
+
+def test_a_speed_is_reached_with_its_acceleration(spec):
+    program = program_of(spec, [], lockstep=False)
+    program.inputs |= registers(9, 0.5, -0.25, 0.0, 0.0, 0.0, 0.0, 2.0)
+    assert program.cycle()
+    speeds = np.array([program.advance() for _ in range(200)])
+    assert speeds[0] == pytest.approx([0.004, -0.002, 0.0, 0.0, 0.0, 0.0])
+    assert speeds[124] == pytest.approx([0.5, -0.25, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_the_watchdog_ends_the_program_after_its_time_and_a_kick_holds_it_off(spec):
+    lines = []
+    program = program_of(spec, lines, lockstep=False)
+    program.inputs |= registers(35, 10.0)
+    program.cycle()
+    assert program.progress == 2
+    for _ in range(3):
+        for _ in range(49):
+            program.advance()
+        assert program.running
+        program.write({"input_int_register_0": 99})
+    for _ in range(51):
+        program.advance()
+    assert not program.running
+    assert lines == ["control program ended by its watchdog, after 0.102 s without a command"]
+
+
+def test_a_program_that_ended_stops_the_arm_within_its_deceleration(spec):
+    program = program_of(spec, [], lockstep=False)
+    program.inputs |= registers(9, *[1.0] * 6, 100.0)
+    program.cycle()
+    for _ in range(20):
+        program.advance()
+    program.stop("for a test")
+    assert np.abs([program.advance() for _ in range(50)][-1]).max() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_program_that_replaces_one_that_moves_begins_with_a_stop(spec):
+    program = program_of(spec, [], lockstep=False)
+    program.inputs |= registers(9, *[1.0] * 6, 100.0)
+    program.cycle()
+    for _ in range(20):
+        program.advance()
+    program.inputs |= registers(0)
+    program.begin()
+    program.cycle()
+    assert np.abs([program.advance() for _ in range(60)][-1]).max() == 0.0
+    assert program.running
+
+
+def test_a_protective_stop_can_be_unlocked_after_five_seconds_and_not_before(spec, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("servobench.harness.serve.program.time.monotonic", lambda: now[0])
+    program = program_of(spec, [], lockstep=False)
+    program.protect("for a test")
+    assert not program.running
+    now[0] += 4.9
+    assert not program.unlock()
+    now[0] += 0.2
+    assert program.unlock()
+    assert program.stopped_at is None
+
+
+def test_a_second_client_that_commands_is_refused_by_either_register(lockstep):
+    server, address, lines = lockstep
+    with commanding(server, address):
+        second = Bytes(address)
+        assert second.set_up(*SPEED)[0] == 0
+        assert second.set_up("input_int_register_24") == (0, ["IN_USE"])
+        assert second.set_up("input_int_register_18")[0] == 1
+        second.close()
+    assert sum("a second client is refused: another one writes input_int_register_" in line for line in lines) == 2
+
+
+def test_a_variable_that_is_not_served_is_named(lockstep):
+    _, address, lines = lockstep
+    client = Bytes(address, "timestamp,actual_q,no_such_thing")
+    assert client.types == ["DOUBLE", "VECTOR6D", NOT_FOUND]
+    assert client.start() == b"\x00"
+    client.close()
+    assert "1 variables are not served, the first is 'no_such_thing'" in lines
+
+
+def test_an_unknown_script_is_named_with_its_date_and_not_carried_out(lockstep):
+    _, address, lines = lockstep
+    with connected(address, "script") as script:
+        script.sendall(b'def rtde_control():\n  textmsg("RTDE Control Script Loaded (01.01.2030-12:00)")\nend\n')
+        said = "a script is not carried out: 83 bytes, dated 01.01.2030-12:00, SHA-256 "
+        assert waited_for(lambda: any(line.startswith(said) for line in lines)), lines
+    assert script_version(b"x") == ("1 bytes, dated nowhere, SHA-256 2d711642b726…", False)
+
+
+def test_scripts_of_other_versions_are_named_and_not_served(monkeypatch):
+    for digest, version in CONTROLLER["scripts"].items():
+        monkeypatch.setattr(hashlib, "sha256", lambda _, digest=digest: SimpleNamespace(hexdigest=lambda: digest))
+        assert script_version(b"") == (f"ur-rtde {version}", "1.6.5" in version)
+
+
+def test_the_dashboard_answers_in_its_words_and_names_what_is_not_served(lockstep):
+    server, address, lines = lockstep
+    with connected(address, "dashboard") as line, line.makefile("rwb", buffering=0) as stream:
+        assert stream.readline() == b"Connected: Universal Robots Dashboard Server\n"
+
+        def answer(words):
+            stream.write(words.encode() + b"\n")
+            return stream.readline().decode().strip()
+
+        assert answer("PolyscopeVersion") == "URSoftware 5.11.0.0"
+        assert answer("unlock protective stop") == "Protective stop releasing"
+        server.program.begin()
+        assert answer("running") == "Program running: true"
+        assert answer("stop") == "Stopped"
+        assert answer("programState") == "STOPPED rtde_control"
+        assert answer("load x.urp") == "could not understand: 'load x.urp'"
+        assert answer("quit") == "Disconnected"
+        assert stream.readline() == b""
+    assert "the dashboard command 'load x.urp' is not served" in lines
+
+
+def test_features_come_as_lines_of_json(lockstep):
+    server, address, _ = lockstep
+    with connected(address, "features") as line, line.makefile("rb") as stream:
+        frame = json.loads(stream.readline())
+    seen = server.rollout.observation
+    assert frame["time"] == seen.time
+    assert frame["feature"] == seen.feature.tolist()
+    assert (frame["names"], frame["unit"], frame["valid"]) == (["x", "y", "z"], "m", [True] * 3)
+
+
+def test_outputs_of_the_control_box_are_set(lockstep):
+    server, address, lines = lockstep
+    client = Bytes(address)
+    number, _ = client.set_up("standard_digital_output_mask", "standard_digital_output")
+    client.send(number, "2B", 8, 8)
+    names = ("standard_analog_output_mask", "standard_analog_output_type")
+    number, _ = client.set_up(*names, "standard_analog_output_0", "standard_analog_output_1")
+    client.send(number, "2B2d", 3, 1, 0.5, 0.25)
+    number, _ = client.set_up("speed_slider_mask", "speed_slider_fraction")
+    client.send(number, "Id", 1, 0.5)
+    assert waited_for(lambda: "setSpeedSlider is not served; speeds stay as commanded" in lines)
+    client.close()
+    assert server.state["actual_digital_output_bits"] == 8
+    assert [server.state[f"standard_analog_output{k}"] for k in (0, 1)] == [5.0, 0.008]
+
+
+def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
+    with served() as (server, address, lines), commanding(server, address) as client:
+
+        def collide(_):
+            raise Collision("the wrist meets the table at 1.000 s")
+
+        monkeypatch.setattr(server.rollout, "advance", collide)
+        client.command(9, *[0.1] * 6, 1.0, 0.05)
+        assert waited_for(lambda: "protective stop: the wrist meets the table at 1.000 s" in lines)
+        assert server.state["safety_status_bits"] == 4
+        with connected(address, "dashboard") as line, line.makefile("rwb", buffering=0) as stream:
+            stream.readline()
+            stream.write(b"unlock protective stop\n")
+            assert stream.readline() == b"Cannot unlock protective stop the wrist meets the table at 1.000 s\n"
+
+
+@pytest.mark.parametrize(
+    ("port", "sent", "said"),
+    [
+        ("RTDE", b"\x00\x01V", "RTDE: a packet must have at least 3 bytes, got a size of 1"),
+        ("RTDE", b"\x00\x09V\x00", "RTDE: the stream ends within a packet, after 1 bytes"),
+        ("RTDE", packed("x"), "RTDE: kind 'x' of packet is none that a client sends"),
+        ("RTDE", packed("U", b"\x07abc"), "RTDE: data are of recipe 7, which this client has not set up"),
+        ("RTDE", packed("O", b"abc"), "RTDE: outputs need a frequency of 1 to 500 Hz, got 0"),
+        ("RTDE", packed("O", struct.pack(">d", 5e-324) + b"actual_q"), "of 1 to 500 Hz, got 4.94066e-324"),
+        ("RTDE", packed("O", struct.pack(">d", math.nan) + b"actual_q"), "of 1 to 500 Hz, got nan"),
+        ("RTDE", packed("I", b"input_int_register_0") + packed("U", b"\x01abc"), "must be 4 bytes, got 3"),
+        ("dashboard", b"x" * 9000, "dashboard: a line must have at most 4096 bytes"),
+        ("script", b"def nothing", "script: 11 bytes that are no control script are not carried out"),
+        ("features", b"more\n", "features: wanted is the word pictures, got 5 other bytes"),
+    ],
+)
+def test_bytes_that_make_no_sense_are_a_line_and_the_end_of_their_connection(lockstep, port, sent, said):
+    _, address, lines = lockstep
+    with connected(address, port) as line:
+        line.sendall(sent)
+        line.shutdown(1)
+        assert waited_for(lambda: any(said in each and each.endswith("the connection is closed") for each in lines)), (
+            lines
+        )
+        while line.recv(65536):
+            pass
+
+
+def test_no_random_bytes_end_the_server(lockstep):
+    _, address, lines = lockstep
+    draw = random.Random(0)
+    for k in range(80):
+        with connected(address, ("RTDE", "dashboard", "script", "features")[k % 4]) as line:
+            body = draw.randbytes(draw.randrange(1, 60))
+            line.sendall(packed(draw.choice("VvOIUSPx"), body) if k % 8 == 0 else body)
+    client = Bytes(address)
+    assert client.start() == b"\x01"
+    client.close()
+    assert not any("Traceback" in line for line in lines)
+
+
+def test_an_arm_without_six_joints_is_no_ur():
+    with pytest.raises(ConfigurationError, match="--robot must be one with 6 joints, as every UR has, got 7"):
+        Server(replace(REQUEST, robot="panda"), Settings({}), print)
+
+
+def test_a_name_is_no_address(monkeypatch, capsys):
+    assert servobench(monkeypatch, "serve", "--address", "robot") == 2
+    assert "--address: 'robot' does not appear to be an IPv4 or IPv6 address" in capsys.readouterr().err
