@@ -25,12 +25,13 @@ EXAMPLES = {
 
 
 LEARNING = {"train_policy", "learned_policy"}  # tested below
+ROBOTS = {"on_a_ur"}  # tests/end_to_end/test_on_a_ur.py
 MOTIONS = {"excite"}  # tests/harness/test_identification.py moves an arm by it
 LAWS = {"damped_inverse": "DampedInverse", "kalman_inverse": "KalmanInverse", "trained_inverse": "TrainedInverse"}
 
 
 def test_every_example_is_listed_here():
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*EXAMPLES, *LEARNING, *LAWS, *MOTIONS}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*EXAMPLES, *LEARNING, *LAWS, *MOTIONS, *ROBOTS}
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -1,0 +1,180 @@
+"""The client `ur-rtde` itself moves a served plant, by docs/examples/on_a_ur.py and by calls of its own."""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+import servobench
+from kit.command import PACKAGE, start
+from kit.documents import ROOT
+from kit.served import fresh_address
+from servobench.plant.robot.camera import CAMERA
+
+pytestmark = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur-rtde has no wheel for this Python")
+EXAMPLE = ROOT / "docs" / "examples" / "on_a_ur.py"
+WIDE = ("--set", "UR.speed=1.0", "--set", "UR.box=[-2.0,-2.0,-2.0,2.0,2.0,2.0]", "--set", "UR.patience=60.0")
+SIGNALS = ("time_s", "reference_", "feature_", "joint_")
+SHORT = {"target": {"duration": 1.0}}
+
+
+def wait_for(process, words):
+    """Wait for a line with these words, and for a second in which more happens."""
+    while words not in (line := process.stdout.readline()):
+        assert line, process.stderr.read()
+    time.sleep(1.0)
+
+
+@contextmanager
+def double(*arguments):
+    """Yield the process of `servobench serve` and its address."""
+    address = fresh_address()
+    process = start("serve", "--task", "target", "--address", address, *arguments)
+    try:
+        wait_for(process, "conformance")
+        yield process, address
+    finally:
+        if not process.stdout.closed:
+            process.terminate()
+            process.communicate(timeout=20)
+
+
+def python(*arguments):
+    """Start Python with arguments, such that the client's lock is not that of the tests."""
+    return subprocess.Popen(
+        [sys.executable, *arguments], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(PACKAGE), "COLUMNS": "200"},
+    )  # fmt: skip
+
+
+def on_a_ur(address, out, *arguments):
+    """Start the example against an address."""
+    return python(str(EXAMPLE), "ukf_mfac", "--out", str(out), "--set", f'UR.host="{address}"', *arguments)
+
+
+def finished(process):
+    """Return the exit code of a process once it has ended, and what it said."""
+    said, errors = process.communicate(timeout=90)
+    return process.returncode, said + errors
+
+
+def numbers(steps):
+    """Return the rows that a controller saw and commanded."""
+    names = [name for name in steps if name.startswith(SIGNALS)]
+    return steps[names].to_numpy(np.float64)
+
+
+@pytest.mark.slow
+def test_in_lockstep_rows_and_commands_are_those_of_a_run(tmp_path):
+    short = ("--set", "target.duration=2.0")
+    with double("--lockstep", *short) as (_, address):
+        code, said = finished(on_a_ur(address, tmp_path / "served", *WIDE, *short))
+    assert code == 0, said
+    settings = {"target": {"duration": 2.0}}
+    run = servobench.run("ukf_mfac", task="target", robot="ur5e", settings=settings)
+    rows = numbers(servobench.load(tmp_path / "served").steps)
+    assert rows.shape == (40, 20)
+    assert np.array_equal(rows, numbers(run.steps))
+
+
+@pytest.mark.slow
+def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
+    with double() as (_, address):
+        patient = ("--set", "UR.patience=20.0", "--set", "target.duration=1.0")
+        code, said = finished(on_a_ur(address, tmp_path / "dry", "--dry-run", *patient))
+    assert code == 0, said
+    joints = servobench.load(tmp_path / "dry").steps.filter(like="joint_position")
+    assert np.ptp(joints.to_numpy(), axis=0).max() == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
+    with double() as (process, address):
+        run = on_a_ur(address, tmp_path / "lost", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
+        wait_for(process, "control program of")
+        process.send_signal(stop)
+        began = time.monotonic()
+        finished(run)
+        assert time.monotonic() - began < 12.0
+        process.send_signal(signal.SIGCONT)
+        process.kill()
+    row = servobench.load(tmp_path / "lost").runs.iloc[0]
+    assert row["status"] == "crashed"
+    assert re.search("timed out|cannot be heard any more|has ended|is not set|JSON", row["reason"]), row["reason"]
+
+
+@pytest.mark.slow
+def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
+    with double("--set", "target.duration=60.0") as (process, address):
+        run = on_a_ur(address, tmp_path / "killed", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
+        wait_for(process, "control program of")
+        run.kill()
+        run.communicate()
+        time.sleep(1.0)
+        process.terminate()
+        said, _ = process.communicate(timeout=20)
+    assert "control program ended by its watchdog" in said
+
+
+CALLS = """
+import sys, time, rtde_control, rtde_receive
+host = sys.argv[1]
+control, receive = rtde_control.RTDEControlInterface(host), rtde_receive.RTDEReceiveInterface(host)
+q = receive.getActualQ()
+target = [q[0] + 0.2, *q[1:]]
+moved = control.moveJ(target, 0.8, 1.4), time.sleep(0.2)
+print(moved[0], max(abs(a - b) for a, b in zip(target, receive.getActualQ())) < 5e-3)
+print(control.speedJ([0.1] * 6, 1.0, 0.05), control.speedStop())
+print(control.servoJ(q, 0, 0, 0.05, 0.1, 300), control.servoStop())
+try:
+    rtde_control.RTDEControlInterface(host)
+except RuntimeError as error:
+    print(error)
+print(control.moveL(receive.getActualTCPPose(), 0.1, 0.1), control.isProgramRunning())
+print(control.reuploadScript(), time.sleep(0.2), control.isProgramRunning())
+control.stopScript()
+print(control.isProgramRunning())
+"""
+
+
+@pytest.mark.slow
+def test_calls_of_the_client_do_what_they_say_or_are_refused_by_name():
+    with double("--lockstep") as (process, address):
+        client = python("-c", CALLS, address)
+        said, errors = client.communicate(timeout=60)
+        assert client.returncode == 0, errors
+        process.terminate()
+        served, _ = process.communicate(timeout=20)
+    lines = said.splitlines()
+    assert lines[:3] == ["True True"] * 3
+    assert lines[3].startswith("One of the RTDE input registers are already in use!")
+    assert lines[-3:] == ["False False", "True None True", "False"]
+    assert "control program ended at moveL (command 3), which is not served" in served
+    assert "a second client is refused: another one writes input_int_register_0" in served
+
+
+def test_a_colour_ball_is_found_where_it_is_and_missed_where_it_is_not():
+    ball, radius, h, w = np.array([0.05, -0.03, 0.8]), 0.03, CAMERA.height, CAMERA.width
+    rays = CAMERA.rays(*(each.ravel() for each in np.meshgrid(np.arange(w), np.arange(h))))
+    along = rays @ ball / (rays**2).sum(axis=1)
+    miss = ((along[:, None] * rays - ball) ** 2).sum(axis=1)
+    hit = miss < radius**2
+    depth = np.where(hit, along - np.sqrt(np.maximum(radius**2 - miss, 0.0) / (rays**2).sum(axis=1)), 1.5).reshape(h, w)
+    image = np.where(hit.reshape(h, w, 1), np.uint8([200, 20, 20]), np.uint8([90, 90, 90]))
+    detector = runpy.run_path(str(EXAMPLE))["ColourBall"]
+    feature, valid, stamp = detector(lambda: (image, depth, 7.0), CAMERA, radius).read()
+    assert (valid, stamp) == (True, 7.0)
+    assert np.abs(feature - ball).max() < 1e-3
+    feature, valid, _ = detector(lambda: (np.zeros_like(image), depth, 7.1), CAMERA, radius).read()
+    assert not valid
