@@ -45,6 +45,8 @@ nightly: $(VENV)/ready
 	$(NIGHT).hostile_sweep --runs 10000
 	$(NIGHT).signed_folders --folders 10000
 	$(NIGHT).kills --kills 100
+	$(NIGHT).served_bytes --inputs 100000
+	$(NIGHT).served_faults --faults 500
 	$(NIGHT).mutation
 
 # Make the golden runs anew (tests/closed_loop/golden_runs.csv), and how far rounding moves them; prints a line for CHANGELOG.md.
