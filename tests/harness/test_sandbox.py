@@ -210,3 +210,24 @@ def test_a_call_returns_how_its_function_ended(how, end):
     assert told == [["begins", how]]
     assert (ended and (ended.status, ended.reason)) == end
     assert multiprocessing.active_children() == []
+
+
+def stop_for_ever(_, tell) -> None:
+    tell(subprocess.Popen(["sleep", "60"], start_new_session=True).pid)
+    time.sleep(0.5)  # the guard passes the answer on first
+    while True:
+        os.kill(os.getppid(), signal.SIGSTOP)
+
+
+@pytest.mark.slow
+def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
+    monkeypatch.setattr(sandbox, "START_TIME", 1.0)
+    monkeypatch.setattr(sandbox, "GRACE", 1.0)
+    told: list[int] = []
+    ended = sandbox.call(stop_for_ever, None, Limits(time=1.0), told.append)
+    assert ended is not None
+    assert ended.status == "timed_out"
+    deadline = time.monotonic() + 5.0
+    while psutil.pid_exists(told[0]) and psutil.Process(told[0]).status() != "zombie":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
