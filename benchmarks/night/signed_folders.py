@@ -215,7 +215,7 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     os.environ["XDG_CACHE_HOME"] = str(place / "cache")
     faults, changed = [], not (signed or _same_files(folder, good))
     drawn_commands = source.choices(list(COMMANDS), list(COMMANDS.values()), k=2)
-    for command in sorted(drawn_commands, key=lambda each: "--resume" in each):  # which mends the folder
+    for command in sorted(drawn_commands, key=lambda each: "--resume" in each or "collect" in each):  # which mend it
         faults += [(command, fault) for fault in _faults(command, folder, good, wanted, changed=changed)]
     if (place / "home" / "victim.csv").read_text() != "precious" or len(list((place / "home").iterdir())) > 2:
         faults.append(("", "outside: the home of the folder was changed"))
