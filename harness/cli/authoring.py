@@ -17,7 +17,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import reason, write_atomically, write_csv
+from servobench.plant.contract.files import write_atomically, write_csv
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -264,7 +264,5 @@ def serve(
             served = server.Server(request, overrides.settings(), say, lockstep=lockstep)
         try:
             asyncio.run(served.serve(address))
-        except OSError as error:
-            raise ConfigurationError(f"{address} cannot be served: {reason(error)}") from error
         finally:
             served.rollout.plant.close()

@@ -8,6 +8,7 @@ import asyncio
 import base64
 import ipaddress
 import json
+import os
 import struct
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Awaitable, Callable, Iterable
@@ -35,9 +36,9 @@ Handler: TypeAlias = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 PORTS: Final = {"RTDE": 30004, "dashboard": 29999, "script": 30003, "features": 30020}  # all but the last are UR's
 RATE: Final = 500.0  # [Hz] of the controller of an e-Series robot
 HEARTBEAT: Final = 0.004  # [s] between two packets while lockstep waits
-SLIP: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
-UNSENT: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
-QUOTA: Final = 50  # packets of a client in a period; the others wait
+BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is dropped
+SEND_BUFFER: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
+PACKETS_A_PERIOD: Final = 50  # packets of a client in a period; the others wait
 SCRIPT_SIZE: Final = 1 << 20  # bytes of a script at most
 LINE_SIZE: Final = 4096  # bytes of a line at most
 
@@ -102,12 +103,22 @@ class Server:
         self._measure()
 
     async def serve(self, address: str) -> None:
-        """Listen at an address and keep the clock until cancelled, or raise an `OSError` for a port that is taken."""
+        """Listen at an address and keep the clock until cancelled.
+
+        Raises:
+            ConfigurationError: a port that cannot be opened.
+        """
         with ExitStack() as stack:
             handlers: tuple[Handler, ...] = (self._rtde, self._dashboard, self._script, self._features)
             for handler, (name, port) in zip(handlers, PORTS.items(), strict=True):
                 guarded = partial(self._guard, name, handler)
-                server = await asyncio.start_server(guarded, address, port, limit=LINE_SIZE)
+                try:
+                    server = await asyncio.start_server(guarded, address, port, limit=LINE_SIZE)
+                except OSError as error:
+                    raise ConfigurationError(
+                        f"{name} port {port} of {address} cannot be opened: {os.strerror(error.errno or 0)}; "
+                        "end what uses it, or serve at another address, such as --address 127.0.0.2"
+                    ) from error
                 stack.callback(server.close)
             if not ipaddress.ip_address(address).is_loopback:
                 self._say(f"warning: whoever reaches {address} can move this plant; there is no password")
@@ -121,7 +132,7 @@ class Server:
                     await asyncio.sleep(0.0 if self.program.busy else HEARTBEAT)
                 else:
                     due += self._spec.period
-                    if (late := clock() - due) > SLIP:
+                    if (late := clock() - due) > BACKLOG:
                         self._say(f"the plant is slower than the wall clock: {1e3 * late:.0f} ms are left out")
                         due += late
                     await asyncio.sleep(max(0.0, due - clock()))
@@ -194,7 +205,7 @@ class Server:
             while (got := await wire.read_packet(reader)) is not None:
                 self._answer(own, *got)
                 own.packets += 1
-                if own.packets > QUOTA and not self._lockstep:
+                if own.packets > PACKETS_A_PERIOD and not self._lockstep:
                     await self._turn.wait()
         finally:
             self._clients.discard(own)
@@ -335,4 +346,4 @@ class Server:
 
 
 def _ready(writer: StreamWriter) -> bool:
-    return not writer.is_closing() and writer.transport.get_write_buffer_size() < UNSENT
+    return not writer.is_closing() and writer.transport.get_write_buffer_size() < SEND_BUFFER

@@ -5,6 +5,7 @@ Here a client speaks bytes; tests/end_to_end/test_on_a_ur.py talks to the server
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import math
@@ -305,12 +306,18 @@ def test_the_dashboard_answers_in_its_words_and_names_what_is_not_served(lockste
 
 def test_features_come_as_lines_of_json(lockstep):
     server, address, _ = lockstep
+    assert waited_for(lambda: not server.program.busy)  # from a test before
     with connected(address, "features") as line, line.makefile("rb") as stream:
         frame = json.loads(stream.readline())
     seen = server.rollout.observation
     assert frame["time"] == seen.time
     assert frame["feature"] == seen.feature.tolist()
     assert (frame["names"], frame["unit"], frame["valid"]) == (["x", "y", "z"], "m", [True] * 3)
+
+
+def test_a_port_that_is_taken_is_named_with_a_remedy(lockstep):
+    with pytest.raises(ConfigurationError, match=f"RTDE port 30004 of {lockstep[1]} cannot be opened: .* --address"):
+        asyncio.run(Server(REQUEST, Settings({}), print).serve(lockstep[1]))
 
 
 def test_outputs_of_the_control_box_are_set(lockstep):
