@@ -114,7 +114,10 @@ class Candidates:
 
 def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> FloatArray:
     """Return Σ_i w_i x_i."""
-    return np.asarray(sum(weight * row for weight, row in zip(weights, rows, strict=True)))
+    first, *others = (weight * row for weight, row in zip(weights, rows, strict=True))
+    for each in others:
+        first = first + each
+    return first
 
 
 class Known(NamedTuple):
