@@ -26,7 +26,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
 from servobench.plant.robot.hand_eye import RobotModel
-from servobench.plant.robot.mechanics import MechanicsConfig
+from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
 MAX_LATENCY: Final = 0.25  # [s]
@@ -39,8 +39,11 @@ PRIORS: Final = {  # standard deviations by the begin of a parameter's name
     "gear": 0.1, "zero": 0.2, "link": 0.1, "backlash": 0.02, "ripple": 0.05, "compliance": 0.01, "turning": 0.2,
     "swing": 0.1, "drift": 0.01,
 }  # fmt: skip
-# The last two are those of places.
 EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
+"""Parameters of gears, clocks, tool and mounting; pixels do not tell the last two."""
+ARM: Final = ("gear", "zero", "link", "tool")
+"""How the names of the arm's own parameters begin."""
+UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
 TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
 SWINGS: Final = np.geomspace(1.0, 20.0, 120)  # [s] periods of the search
 SWINGS_IN_LOG: Final = 3  # at least
@@ -117,6 +120,15 @@ class Identified:
         """Return a parameter and its standard deviation; 0 and infinite for one that the log does not have."""
         where = [k for k, own in enumerate(self.names) if own == name]
         return next(((float(self.values[k]), float(self.deviations[k])) for k in where), (0.0, np.inf))
+
+    def sizes(self) -> dict[str, float]:
+        """Return gears, zeros, links and tool by name, in deviations of their priors."""
+        known = zip(self.names, self.values.tolist(), strict=True)
+        return {name: value / prior(name) for name, value in known if name.startswith(ARM)}
+
+    def unlikely(self) -> list[str]:
+        """Return the names of those that are far from the nominal robot."""
+        return [name for name, size in self.sizes().items() if abs(size) > UNLIKELY]
 
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
@@ -200,7 +212,7 @@ class _Problem:
             late = steady + values["swing_sin"] * np.sin(phase) + values["swing_cos"] * np.cos(phase)
         time = self.time - late
         q = self.motion(time)
-        q = q + values["ripple"] * np.sin(RIPPLE_ORDER * q) + values["backlash"] * self.play(time)
+        q = transmitted(q, values["ripple"], RIPPLE_ORDER) + values["backlash"] * self.play(time)
         y = np.asarray(deviated(self.model, values).feature(q))
         if "turning" in values:
             y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
@@ -218,7 +230,7 @@ class _Problem:
         """Take the pose of the camera for that from which it deviates, and return the z that is left."""
         self.model, values = self.model.with_camera(self.pose(z)), self.values(z)
         size = max(abs(values["backlash"]), MIN_PLAY)
-        gears = self.log.joints + values["ripple"] * np.sin(RIPPLE_ORDER * self.log.joints)
+        gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
         self.play = CubicSpline(self.log.time, played(gears, size) / size)
         rigid = deviated(self.model, values | dict.fromkeys(CAMERA, 0.0))
         self.pull = CubicSpline(self.log.time, rigid.feature(self.log.joints)).derivative(2)
@@ -253,8 +265,9 @@ class _Problem:
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
     """Return places (k, 3) as a camera sees them that is turned about its optical axis by angles (k,) [rad]."""
-    (x, y, depth), c, s = places.T, np.cos(angle), np.sin(angle)
-    return np.stack([c * x + s * y, c * y - s * x, depth], axis=1)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - as above
+
+    return np.asarray(Rotation.from_euler("z", -angle[:, None]).apply(places))
 
 
 def played(joints: FloatArray, size: float) -> FloatArray:

@@ -11,16 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from servobench.harness.run.identification import (
-    MIN_FRAMES,
-    OUTLIER,
-    Identified,
-    Log,
-    camera_pose,
-    frames_of,
-    identify,
-    prior,
-)
+from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, camera_pose, frames_of, identify
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -29,7 +20,6 @@ MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before alth
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
 MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
-UNLIKELY: Final = 3.0  # [1] prior deviations of a gear, zero, link or tool
 GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
 SCREENED: Final = 6  # mistakes that are looked at closely
@@ -84,15 +74,9 @@ def noise_of(log: Log) -> FloatArray:
     return np.asarray(1.4826 * np.median(np.abs(third), axis=0) / math.sqrt(20.0))
 
 
-def _sizes(robot: Identified) -> FloatArray:
-    """Return gears, zeros, links and tool in deviations of their priors."""
-    known = zip(robot.names, robot.values.tolist(), strict=True)
-    return np.array([value / prior(name) for name, value in known if name.startswith(("gear", "zero", "link", "tool"))])
-
-
 def is_explained(log: Log, robot: Identified) -> bool:
     """Return whether residuals are not far above the noise, and no parameter is unlikely."""
-    return _is_noise(log, robot) and bool(np.abs(_sizes(robot)).max() < UNLIKELY)
+    return _is_noise(log, robot) and not robot.unlikely()
 
 
 def _is_noise(log: Log, robot: Identified) -> bool:
@@ -206,10 +190,10 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
 
     def misfit(each: _Remedy, begin: Mapping[str, float] | None = None) -> float:
         robot = identify(each.log, each.model, FRAMES, fits=2, begin=begin)
-        if known and begin is None and np.abs(_sizes(robot)).max() > UNLIKELY:
+        if known and begin is None and robot.unlikely():
             return np.inf
         error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
-        return float(error.sum() + np.sum(_sizes(robot) ** 2))
+        return float(error.sum()) + sum(size**2 for size in robot.sizes().values())
 
     tried = sorted(_remedies(log, model, others), key=quick)[:SCREENED]
     as_it_is, misfits = misfit(_Remedy("", log, model), known), [misfit(each) for each in tried]

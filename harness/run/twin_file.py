@@ -20,9 +20,8 @@ WHITE: Final = 3.0  # [1] deviations of a correlation from none, up to which res
 CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft tool and the like
 MIN_LATE: Final = 0.02  # [s] by which frames must be late by changing times
 MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
-FAR: Final = 3.0  # [1] prior deviations
-SLOW: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
-BURST: Final = 2.0  # [1] lost frames in a row over those of independent losses
+SLOW_SHARE: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
+BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
 JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
 UNITS: Final = {  # of parameters as they are printed, by the begin of their names, and how many are one of their own
     "latency": ("ms", 1e3), "camera_turn": ("°", 180.0 / math.pi), "camera": ("mm", 1e3), "tool": ("mm", 1e3),
@@ -68,9 +67,10 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
             f"delay and lag leave {response.unexplained:.0%} of the joint motion: the drive is no first-order lag"
         )
     for section, settings in sensor(log, robot).settings.items():
-        lines.append(f"{section}: {', '.join(f'{name} {value:.3g}' for name, value in settings.items())}")
-    sizes = zip(robot.names, np.abs(robot.values) / np.array([prior(name) for name in robot.names]), strict=True)
-    if far := [name for name, size in sizes if size > FAR and name.startswith(("gear", "zero", "link", "tool"))]:
+        lines.append(
+            f"settings of a plant: {', '.join(f'{section}.{name}={value:.3g}' for name, value in settings.items())}"
+        )
+    if far := robot.unlikely():
         lines.append(f"far from the nominal robot: {', '.join(far)}; is it this arm?")
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
     told = [name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS]
@@ -154,7 +154,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     elif spread > MIN_LATE:
         tried = [(arrivals(log.spec.period, jitter), jitter) for jitter in JITTERS]
         waiting, sensing["jitter"] = min(tried, key=lambda each: abs(each[0].deviation - spread))
-    elif gap * (1.0 - lost) > BURST:
+    elif gap * (1.0 - lost) > BURST_RATIO:
         sensing |= {"occlusions": lost, "occlusion_duration": gap * frame_period(log)}
         lost = 0.0
     if waiting.mean:
@@ -168,7 +168,7 @@ def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray
     """Return the certain part of σ [s], Σ by the slow frames, and which frames are no outliers."""
     rates = np.gradient(log.features[robot.rows] - robot.residuals, log.time[robot.rows], axis=0)
     speed, square = np.sum(rates**2, axis=1), np.sum(robot.residuals**2, axis=1)
-    slow = robot.inliers & (speed <= np.quantile(speed, SLOW))
+    slow = robot.inliers & (speed <= np.quantile(speed, SLOW_SHARE))
     usual = float(np.mean(square[slow])) + 1e-18
     kept = square < OUTLIER * (usual / log.spec.m + MAX_SPREAD**2 * speed)
     weight = kept / (usual + MAX_SPREAD**2 * speed)

@@ -58,7 +58,7 @@ class MechanicsConfig:
 
     def transmitted(self, q: FloatArray) -> FloatArray:
         """Return g, (..., n) rad."""
-        return q + self.ripple * np.sin(self.ripple_order * q)
+        return transmitted(q, self.ripple, self.ripple_order)
 
     def slope(self, q: FloatArray) -> FloatArray:
         """Return ∂g/∂q, (..., n)."""
@@ -98,6 +98,11 @@ class MechanicsConfig:
         """
         if self.tool_frequency > 0.0 and model.channel is not FEATURE:
             raise ValueError("mechanics.tool_frequency needs --sensing position; leave it at 0 with other sensing")
+
+
+def transmitted(q: FloatArray, ripple: float, order: float) -> FloatArray:
+    """Return g = q + r sin(k q), (..., n) rad, for a ripple r [rad] of k periods in a turn."""
+    return q + ripple * np.sin(order * q)
 
 
 @dataclass(frozen=True, eq=False)
