@@ -83,8 +83,6 @@ class UR(servobench.Plant):
         alive = stamp > last and all(each.isConnected() for each in (self.receive, self.control) if each)
         if not alive or (self.control and not self.receive.getRobotStatus() & 2):  # a `true` of a call proves nothing
             raise RuntimeError("the control program has ended" if alive else "the robot cannot be heard any more")
-        if self.control and not self.control.setWatchdog(1.0 / (1.8 * self.spec.period)):  # lost where it reconnects
-            raise RuntimeError("the watchdog is not set")
         q, same = np.array(self.receive.getActualQ()), before and (feature == before.feature).all()
         valid = valid and shown > self.shown and not (self.seen and same and np.ptp(q - before.joint_position) > 1e-3)
         self.k, self.seen, self.shown, self.stamp = self.k + 1, self.seen or (before and not same), shown, stamp
@@ -99,8 +97,9 @@ class UR(servobench.Plant):
         late = time.monotonic() - self.began > self.patience
         if late or (np.clip(at, low, high) != at).any():
             raise RuntimeError("the controller is late" if late else f"the arm leaves its range at {at.round(3)}")
-        if self.control:
-            self.control.speedJ(v.tolist(), self.config.acceleration, spec.period)
+        robot, rate = self.control, 1.0 / (1.8 * spec.period)  # [1/s] of commands at least; ur-rtde may lose it
+        if robot and not (robot.setWatchdog(rate) and robot.speedJ(v.tolist(), self.config.acceleration, spec.period)):
+            raise RuntimeError("the robot takes no command")
         return self.observe()
 
     def truth(self):
