@@ -40,13 +40,16 @@ def parameters(true: RobotModel, nominal: RobotModel) -> dict[str, float]:
 
 
 def draw_hidden(seed: int, plant: str) -> tuple[str, str, dict[str, Any]]:
-    """Return robot, mismatch and settings of a hidden plant: latency, delay, lag and noise."""
+    """Return robot, mismatch and settings of a hidden plant: latency, delay, lag, noise; friction and load of half."""
     draws = np.random.default_rng(seed)
     robot, mismatch = str(draws.choice(ARMS)), str(draws.choice(MISMATCHES))
     latency, delay, lag = (round(float(draws.uniform(0.0, most)), 3) for most in (0.13, 0.06, 0.1))
     shape = np.diag(draws.uniform(0.5, 2.0, 3))
     sections: dict[str, Any] = {"sensing": {"latency": latency, "noise_shape": shape.tolist()}, "command_delay": delay}
-    return robot, mismatch, sections | ({"lag": max(lag, 0.01)} if plant == "kinematic" else {"scenery": False})
+    if plant == "kinematic":
+        return robot, mismatch, sections | {"lag": max(lag, 0.01)}
+    free = {"coulomb_friction": [0.0], "viscous_friction": [0.0], "payload": 0.0, "assumed_payload": 0.0}
+    return robot, mismatch, sections | {"scenery": False, "drives": free if draws.random() < 0.5 else {}}
 
 
 def hidden(seed: int, plant: str) -> list[dict[str, Any]]:

@@ -65,6 +65,8 @@ class Relay:
                 server = socket.create_connection((self.server, port))
             except OSError:
                 return
+            for each in (client, server):  # otherwise a small packet waits for the answer to the one before
+                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._open += [client, server]
             change = self._packets if port == PORTS["RTDE"] else self._whole
             back = self._frames if port == PORTS["features"] else self._whole

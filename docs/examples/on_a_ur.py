@@ -9,6 +9,7 @@ import socket
 import sys
 import time
 from dataclasses import dataclass
+from select import select
 from threading import Thread
 
 import numpy as np
@@ -37,10 +38,12 @@ class Served:
     """Features of `servobench serve`, lines of JSON: `read` returns (m,), whether it is valid, and its time [s]."""
 
     def __init__(self, host, patience):
-        self.lines = socket.create_connection((host, 30020), timeout=patience).makefile("rb")
+        self.lines = socket.create_connection((host, 30020), timeout=patience).makefile("rb", buffering=0)
 
     def read(self):
         frame = json.loads(self.lines.readline())
+        while select([self.lines], [], [], 0.0)[0]:  # the last one, where some wait
+            frame = json.loads(self.lines.readline())
         return np.array(frame["feature"]), all(frame["valid"]), frame["time"]
 
 
@@ -76,11 +79,10 @@ class UR(servobench.Plant):
 
     def observe(self):
         faulthandler.dump_traceback_later(2.0 + self.patience, exit=True)
-        (feature, valid, shown), before, last = self.detector.read(), self.before, self.stamp
-        self.began = time.monotonic()
-        while (stamp := self.receive.getTimestamp()) <= last and time.monotonic() < self.began + self.patience:
+        (feature, valid, shown), self.began, before = self.detector.read(), time.monotonic(), self.before
+        while (stamp := self.receive.getTimestamp()) <= self.stamp and time.monotonic() < self.began + self.patience:
             pass
-        alive = stamp > last and all(each.isConnected() for each in (self.receive, self.control) if each)
+        alive = stamp > self.stamp and all(each.isConnected() for each in (self.receive, self.control) if each)
         if not alive or (self.control and not self.receive.getRobotStatus() & 2):  # a `true` of a call proves nothing
             raise RuntimeError("the control program has ended" if alive else "the robot cannot be heard any more")
         q, same = np.array(self.receive.getActualQ()), before and (feature == before.feature).all()
@@ -90,16 +92,15 @@ class UR(servobench.Plant):
         return self.before
 
     def step(self, command):
-        spec, top, box = self.spec, self.spec.joint_velocity_limit, self.config.box
-        v = np.clip(command.joint_velocity, -top, top)
+        spec, box, robot, rate = self.spec, self.config.box, self.control, 1.0 / (1.8 * self.spec.period)
+        v = np.clip(command.joint_velocity, -spec.joint_velocity_limit, spec.joint_velocity_limit)
         at = np.append(ahead := self.before.joint_position + 2.0 * spec.period * v, self.arm.frames(ahead)[-1][:3, 3])
         low, high = np.append(spec.joint_lower, box[:3]), np.append(spec.joint_upper, box[3:])
         late = time.monotonic() - self.began > self.patience
         if late or (np.clip(at, low, high) != at).any():
             raise RuntimeError("the controller is late" if late else f"the arm leaves its range at {at.round(3)}")
-        robot, rate = self.control, 1.0 / (1.8 * spec.period)  # [1/s] of commands at least; ur-rtde may lose it
         if robot and not (robot.setWatchdog(rate) and robot.speedJ(v.tolist(), self.config.acceleration, spec.period)):
-            raise RuntimeError("the robot takes no command")
+            raise RuntimeError("the robot takes no command")  # the watchdog is set anew, as ur-rtde loses it by itself
         return self.observe()
 
     def truth(self):
