@@ -175,6 +175,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     assert places == sorted(places)
     if find_browser() is not None:
         assert overhang(tmp_path / "index.html", 1024) <= 0
+        assert overhang(tmp_path / "methods_reference.html", 1024) <= 0
     loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]*)"', index)
     assert loaded
     assert [place for place in loaded if "//" in place] == []  # it opens without a network
