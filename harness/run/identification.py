@@ -130,6 +130,10 @@ class Identified:
         """Return the names of those that are far from the nominal robot."""
         return [name for name, size in self.sizes().items() if abs(size) > UNLIKELY]
 
+    def rates(self, log: Log) -> FloatArray:
+        """Return how fast the features of these frames move, (k, m), 1/s."""
+        return np.asarray(np.gradient(log.features[self.rows] - self.residuals, log.time[self.rows], axis=0))
+
     def model(self, nominal: RobotModel) -> RobotModel:
         """Return the robot at θ, given the nominal one."""
         values = dict(zip(self.names, self.values.tolist(), strict=True))

@@ -19,6 +19,7 @@ MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the no
 MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
+UNLIKE: Final = 0.1  # [1] of the motion of features, above which errors are no robot's
 MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
 GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
@@ -60,7 +61,7 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
     found = _drift(log, robot)
     if not is_explained(log, robot):
         known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
-        found = _undone(log, model, others, known) or found
+        found = _undone(log, model, others, known) or found or _unlike(log, robot)
     return found, None if found else robot
 
 
@@ -144,9 +145,25 @@ def _repeats(log: Log) -> str:
     )
 
 
+def _unlike(log: Log, robot: Identified) -> str:
+    """Tell that a log is of no such robot, by errors that are a large part of the motion."""
+    share = float(np.sqrt(np.diag(robot.noise)).max() / np.std(log.features[robot.rows], axis=0).max())
+    if share < UNLIKE or _is_noise(log, robot):
+        return ""
+    return (
+        f"errors are {share:.0%} of the motion, and no single mistake explains them: there may be two; check order, "
+        "directions and zeros of the joints, the axes of the camera, and whether it was moved"
+    )
+
+
 def _drift(log: Log, robot: Identified) -> str:
     """Name clocks of which one gains on the other."""
     drift, deviation = robot.estimate("drift")
+    time, rates = log.time[robot.rows], robot.rates(log) * robot.inliers[:, None]
+    shifts, speeds = np.sum(rates * robot.residuals, axis=1), np.sum(rates**2, axis=1)
+    weights = time - np.average(time, weights=speeds)  # of the lateness of each frame in the drift
+    scatter = math.sqrt(robot.correlation * np.sum((weights * shifts) ** 2)) / float(np.sum(weights**2 * speeds))
+    deviation = max(deviation, scatter)  # larger where fast frames are late by changing times
     total = 1e3 * float(np.ptp(log.time))  # [ms]
     if abs(drift) < max(CERTAIN * deviation, DRIFT / total):
         return ""

@@ -21,6 +21,7 @@ CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft too
 MIN_LATE: Final = 0.02  # [s] by which frames must be late by changing times
 MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
 SLOW_SHARE: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
+LATE_SHARE: Final = 0.2  # [1] of the mean square of what lateness moves a feature by, which its median exceeds
 BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
 JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
 UNITS: Final = {  # of parameters as they are printed, by the begin of their names, and how many are one of their own
@@ -166,8 +167,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
 
 def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray]:
     """Return the certain part of σ [s], Σ by the slow frames, and which frames are no outliers."""
-    rates = np.gradient(log.features[robot.rows] - robot.residuals, log.time[robot.rows], axis=0)
-    speed, square = np.sum(rates**2, axis=1), np.sum(robot.residuals**2, axis=1)
+    speed, square = np.sum(robot.rates(log) ** 2, axis=1), np.sum(robot.residuals**2, axis=1)
     slow = robot.inliers & (speed <= np.quantile(speed, SLOW_SHARE))
     usual = float(np.mean(square[slow])) + 1e-18
     kept = square < OUTLIER * (usual / log.spec.m + MAX_SPREAD**2 * speed)
@@ -178,7 +178,9 @@ def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray
     left = square - slope * speed
     deviation = float(np.linalg.norm(apart * (left - np.average(left, weights=weight)))) / size
     share = max(float(np.mean(left[slow])) / usual, 0.1)
-    return (slope**0.5 if slope > CERTAIN * deviation else 0.0), share * np.cov(robot.residuals[slow].T), kept
+    fast = kept & (speed > np.median(speed))  # outliers enlarge few of them, lateness most
+    late = slope > CERTAIN * deviation and float(np.median(square[fast] / (slope * speed[fast]))) > LATE_SHARE
+    return (slope**0.5 if late else 0.0), share * np.cov(robot.residuals[slow].T), kept
 
 
 class Waiting(NamedTuple):

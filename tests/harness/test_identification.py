@@ -280,6 +280,7 @@ WORLDS = {  # mismatch -> section, and settings with the share by which they may
     "latency_swing=100ms": ("sensing", {"latency_swing": (0.1, 0.15), "swing_period": (4.0, 0.05)}),
     "jitter=200ms": ("sensing", {"jitter": (0.2, 0.25)}),
     "occlusions=50%": ("sensing", {"occlusions": (0.5, 0.4), "occlusion_duration": (0.5, 0.2)}),
+    "outliers=20%": ("", {}),
     "none": ("", {}),
 }
 
@@ -302,6 +303,25 @@ def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, 
     path.write_text(twin_text(robot, log, command_response(log), ("ur5", "position")), encoding="utf-8")
     row = run("constant", robot=str(path), mismatch="none", settings={"exp1": {"duration": 1.0}}).row
     assert row["status"] == "completed"
+
+
+@pytest.mark.slow
+def test_a_log_that_no_single_mistake_explains_is_refused():
+    log, _, model = logged()
+    order = np.argsort(np.argsort(log.spec.joint_names))
+    text, robot = mistakes(log._replace(joints=log.joints[:, order], features=log.features * (1, 1, -1)), model, {})
+    assert "of the motion, and no single mistake explains them: there may be two" in text
+    assert robot is None
+
+
+@pytest.mark.slow
+def test_frames_late_by_changing_times_are_no_clocks_that_drift():
+    settings = {"random": {"duration": 60.0}, "run": {"lost_after": 20.0}, "Excite": {"swing": 0.25, "fastest": 0.5}}
+    nominal, lines = find_robot("ur5").nominal, []
+    for seed in range(173400, 173406):
+        made = run("docs/examples/excite.py", task="random", mismatch="jitter=200ms", seed=seed, settings=settings)
+        lines.append(mistakes(read_log(logged()[0].spec, made.steps), nominal, {})[0])
+    assert lines == [""] * len(lines)
 
 
 def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
