@@ -52,7 +52,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
     "statistics": (
         ("harness/analysis/comparison.py", "harness/analysis/scores.py"),
-        ("harness/test_statistics.py", "harness/test_scores.py"),
+        ("harness/test_statistics.py", "harness/test_scores.py", "harness/test_verdict.py", "harness/test_tables.py"),
     ),
     "results": (
         ("harness/batch/results.py", "harness/batch/tables.py"),
