@@ -100,7 +100,7 @@ class UR(servobench.Plant):
         if late or (np.clip(at, low, high) != at).any():
             raise RuntimeError("the controller is late" if late else f"the arm leaves its range at {at.round(3)}")
         if robot and not (robot.setWatchdog(rate) and robot.speedJ(v.tolist(), self.config.acceleration, spec.period)):
-            raise RuntimeError("the robot takes no command")  # the watchdog is set anew, as ur-rtde loses it by itself
+            raise RuntimeError("the robot takes no command")  # ur-rtde loses its watchdog where it reconnects
         return self.observe()
 
     def truth(self):

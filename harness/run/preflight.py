@@ -19,7 +19,7 @@ MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the no
 MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
-UNLIKE: Final = 0.1  # [1] of the motion of features, above which errors are no robot's
+REFUSED_SHARE: Final = 0.1  # [1] of the motion of features, from which errors that nothing explains are refused
 MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
 GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
@@ -61,7 +61,7 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
     found = _drift(log, robot)
     if not is_explained(log, robot):
         known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
-        found = _undone(log, model, others, known) or found or _unlike(log, robot)
+        found = _undone(log, model, others, known) or found or _large_errors(log, robot)
     return found, None if found else robot
 
 
@@ -82,9 +82,13 @@ def is_explained(log: Log, robot: Identified) -> bool:
 
 def _is_noise(log: Log, robot: Identified) -> bool:
     spread = np.sqrt(np.diag(robot.noise))
-    size = np.std(log.features[robot.rows], axis=0).max()
-    rest = (spread > UNEXPLAINED * noise_of(log)) & (spread > MIN_SHARE * size)
+    rest = (spread > UNEXPLAINED * noise_of(log)) & (_shares(log, robot) > MIN_SHARE)
     return bool(not rest.any() and robot.inliers.mean() > 0.5)
+
+
+def _shares(log: Log, robot: Identified) -> FloatArray:
+    """Return the errors of a feature over its motion, (m,)."""
+    return np.asarray(np.sqrt(np.diag(robot.noise)) / np.std(log.features[robot.rows], axis=0).max())
 
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
@@ -145,10 +149,10 @@ def _repeats(log: Log) -> str:
     )
 
 
-def _unlike(log: Log, robot: Identified) -> str:
-    """Tell that a log is of no such robot, by errors that are a large part of the motion."""
-    share = float(np.sqrt(np.diag(robot.noise)).max() / np.std(log.features[robot.rows], axis=0).max())
-    if share < UNLIKE or _is_noise(log, robot):
+def _large_errors(log: Log, robot: Identified) -> str:
+    """Name errors that are a large part of the motion."""
+    share = float(_shares(log, robot).max())
+    if share < REFUSED_SHARE or _is_noise(log, robot):
         return ""
     return (
         f"errors are {share:.0%} of the motion, and no single mistake explains them: there may be two; check order, "

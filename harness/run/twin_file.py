@@ -21,7 +21,7 @@ CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft too
 MIN_LATE: Final = 0.02  # [s] by which frames must be late by changing times
 MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
 SLOW_SHARE: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
-LATE_SHARE: Final = 0.2  # [1] of the mean square of what lateness moves a feature by, which its median exceeds
+LATE_RATIO: Final = 0.2  # [1] median over mean of squared errors, above which fast frames are late and not false
 BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
 JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
 UNITS: Final = {  # of parameters as they are printed, by the begin of their names, and how many are one of their own
@@ -179,7 +179,7 @@ def _lateness(log: Log, robot: Identified) -> tuple[float, FloatArray, BoolArray
     deviation = float(np.linalg.norm(apart * (left - np.average(left, weights=weight)))) / size
     share = max(float(np.mean(left[slow])) / usual, 0.1)
     fast = kept & (speed > np.median(speed))  # outliers enlarge few of them, lateness most
-    late = slope > CERTAIN * deviation and float(np.median(square[fast] / (slope * speed[fast]))) > LATE_SHARE
+    late = slope > CERTAIN * deviation and float(np.median(square[fast] / (slope * speed[fast]))) > LATE_RATIO
     return (slope**0.5 if late else 0.0), share * np.cov(robot.residuals[slow].T), kept
 
 
