@@ -39,9 +39,8 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     ),
     "estimators": (
         ("controllers/estimators/*.py",),
-        ("controllers/test_estimators.py", "controllers/test_arm_estimator.py", "controllers/test_rbf.py",
-         "controllers/test_estimator_lanes.py", "controllers/test_correntropy.py",
-         "controllers/test_robust_filter.py"),
+        ("controllers/test_estimators.py", "controllers/test_rbf.py", "controllers/test_estimator_lanes.py",
+         "controllers/test_correntropy.py", "controllers/test_robust_filter.py"),
     ),
     "laws": (
         ("controllers/laws/*.py", "controllers/laws/mpc/*.py", "controllers/periods.py"),
@@ -49,10 +48,14 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
          "controllers/test_periods.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
          "controllers/test_mpc_closed_form.py", "controllers/test_mpc_optimality.py"),
     ),
-    "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
+    "metrics": (
+        ("harness/run/metrics.py",),
+        ("harness/test_metrics.py", "harness/test_metrics_oracle.py", "harness/test_page_tables.py"),
+    ),
     "statistics": (
         ("harness/analysis/comparison.py", "harness/analysis/scores.py"),
-        ("harness/test_statistics.py", "harness/test_scores.py", "harness/test_verdict.py", "harness/test_tables.py"),
+        ("harness/test_statistics.py", "harness/test_scores.py", "harness/test_verdict.py", "harness/test_tables.py",
+         "harness/test_page_tables.py"),
     ),
     "results": (
         ("harness/batch/results.py", "harness/batch/tables.py"),
@@ -184,6 +187,8 @@ def examine(group: str, most: int, seed: int) -> tuple[int, Examination]:
     patterns, files = GROUPS[group]
     modules = sorted(str(path.relative_to(ROOT)) for pattern in patterns for path in ROOT.glob(pattern))
     tests = [str(ROOT / "tests" / name) for name in files]
+    if missing := [test for test in tests if not Path(test).exists()]:
+        sys.exit(f"the unit tests of {group} are not there: {' '.join(missing)}")
     all_of_them = [mutant for module in modules for mutant in mutants(module)]
     chosen = random.Random(seed).sample(all_of_them, min(most, len(all_of_them)))
     options = ["-x", "-q", "-s", "--tb=no", "-p", "no:cacheprovider", f"--hypothesis-profile={PROFILE}", "-W", IMPORTED]

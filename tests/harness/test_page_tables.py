@@ -159,6 +159,46 @@ def test_settings_are_told_in_words(tmp_path):
     }  # fmt: skip
 
 
+def test_each_metric_is_shown_in_its_unit_with_its_digits():
+    values = dict.fromkeys(METRICS, 1.2345678) | {"rms_error_second_lap": 2.3456789}
+    curve = values | {"task": "circle", "task_kind": "curve"}
+    runs = pd.DataFrame([made_up_row("0", **values), made_up_row("1", **curve)])
+    pages = {"moves": tables.move_tables(runs)["exp1"], "curves": tables.curve_tables(runs)["circle"]}
+    pages |= {"cost": tables.cost_table(runs[:1]), "runs": tables.runs_table(runs)}
+    shown = {name: {heading: table[group, heading][0] for group, heading in table} for name, table in pages.items()}
+    for table in shown.values():
+        for name in ("controller", "number", "settled [%]", "followed [%]", "lost [%]"):
+            table.pop(name, None)
+    assert shown["moves"] == {
+        "settling time [s]": "1.23", "overshoot [%]": "123.5", "error of the last second [mm]": "1234.57",
+        "pose error of the last second [mm]": "1.2", "angle error of the last second [deg]": "1.23",
+        "path ratio": "1.235", "sign switches": "1",
+    }  # fmt: skip
+    assert shown["curves"] == {
+        "RMS error of the second lap [mm]": "2345.68", "RMS error of the judged part [mm]": "1234.57",
+        "largest joint position [rad]": "1.23", "sign switches": "1",
+    }  # fmt: skip
+    assert shown["cost"] == {
+        "step, median [µs]": "1", "step, 99 % [µs]": "1", "steps over the period": "1", "control effort [rad]": "1.23",
+        "saturated periods [%]": "123.5", "RMS acceleration [rad/s²]": "1.23", "RMS jerk [rad/s³]": "1.2",
+        "mean Jacobian error [%]": "123.5",
+    }  # fmt: skip
+    assert shown["runs"] == {
+        "task": "exp1", "seed": "0", "status": "completed", "outcome": "settled", "settling time [s]": "1.23",
+        "error of the last second [mm]": "1234.57", "RMS error of the judged part [mm]": "1234.57",
+        "control effort [rad]": "1.23",
+    }  # fmt: skip
+    moves, curves = (table.iloc[0, 2:].to_dict() for _, table in tables.summary_tables(runs))
+    assert moves == {
+        "settling time [s]": "1.23", "overshoot [%]": "123", "error of the last second [mm]": "1234.6",
+        "sign switches": "1", "step, median [µs]": "1*",
+    }  # fmt: skip
+    assert curves == {
+        "RMS error of the second lap [mm]": "2345.7", "RMS error of the judged part [mm]": "1234.6",
+        "largest joint position [rad]": "1.23", "sign switches": "1", "step, median [µs]": "1*",
+    }  # fmt: skip
+
+
 def test_every_place_that_a_metric_names_exists():
     for metric in METRICS.values():
         assert all(group in tables.GROUPS[table] for table, group in metric.tables.items()), metric.column

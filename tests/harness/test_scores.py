@@ -27,8 +27,10 @@ def test_a_score_is_the_floored_reference_over_the_floored_own_value():
     expected = [1.0, 1.0, 1.5 / 4.0, 1.0, 0.0, 0.0, 1.0, 0.0]
     assert scores(own, reference, [2.0, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5]).tolist() == expected
     assert scores(4.0, 1.0, 1.5) == 0.375
-    with pytest.raises(ValueError, match="floor must be above 0, got 0"):
-        scores(own, reference, 0.0)
+    assert scores(4.0, 1.0, 0.5) == 0.25
+    for floor in (0.0, [0.0, *[1.0] * 7]):
+        with pytest.raises(ValueError, match="floor must be above 0, got 0"):
+            scores(own, reference, floor)
 
 
 def test_an_interquartile_mean_is_the_mean_of_the_middle_half_of_all_challenges_together():
@@ -45,6 +47,14 @@ def test_the_interval_of_an_interquartile_mean_is_stratified_by_challenge():
     table = tidy("score", {"a": {"x": [0.2] * 10, "y": [0.6] * 10, "z": [0.9] * 20}})
     middle = ranking(table)[0].score
     assert (middle.low, middle.high) == pytest.approx((middle.value, middle.value))
+
+
+def test_the_interval_is_as_wide_as_scipys():
+    sample = np.random.default_rng(4).uniform(0.2, 0.8, 60)
+    middle = ranking(tidy("score", {"a": {"x": sample}}))[0].score
+    wanted = stats.bootstrap((sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0)
+    low, high = wanted.confidence_interval
+    assert middle.high - middle.low == pytest.approx(high - low, rel=0.1)
 
 
 def test_the_interval_covers_the_true_mean_in_nearly_95_percent_of_samples(monkeypatch):
@@ -77,7 +87,16 @@ def test_a_small_difference_on_every_robot_is_told_apart_as_robots_are_shared():
 
 
 def test_equal_methods_share_a_rank_without_a_deviation():
-    assert [each.rank for each in ranking(tidy("score", {"a": {"x": [0.5] * 4}, "b": {"x": [0.5] * 4}}))] == [1, 1]
+    for other, ranks in ((0.5, [1, 1]), (0.4, [1, 2])):
+        found = ranking(tidy("score", {"a": {"x": [0.5] * 4}, "b": {"x": [other] * 4}}))
+        assert [each.rank for each in found] == ranks
+
+
+def test_a_rank_is_shared_with_the_best_one_in_it_and_not_with_the_last():
+    robots, noise = np.random.default_rng(6).uniform(0.3, 0.7, 60), np.random.default_rng(7).normal(0.0, 0.1, 60)
+    values = {"best": robots, "noisy": robots - 0.01 + noise - noise.mean(), "worse": robots - 0.02}
+    ranked = ranking(tidy("score", {name: {"x": own} for name, own in values.items()}))
+    assert [(each.rank, each.controller) for each in ranked] == [(1, "best"), (1, "noisy"), (3, "worse")]
 
 
 def test_a_profile_counts_pairs_within_a_factor_of_the_best():
@@ -85,8 +104,10 @@ def test_a_profile_counts_pairs_within_a_factor_of_the_best():
     shares = profile(table, (1.0, 2.0))
     assert shares.loc[1.0].to_dict() == {"a": 0.5, "b": 0.25}
     assert shares.loc[2.0].to_dict() == {"a": 0.75, "b": 0.5}
-    with pytest.raises(ValueError, match=r"factors must be at least 1, got 0\.5"):
-        profile(table, (0.5,))
+    assert profile(tidy("value", {"b": {"x": [1.0]}, "a": {"x": [2.0]}}), (1.0,)).columns.tolist() == ["b", "a"]
+    for factors in ((0.5,), (0.5, 2.0)):
+        with pytest.raises(ValueError, match=r"factors must be at least 1, got 0\.5"):
+            profile(table, factors)
 
 
 def test_halves_of_four_robots_differ_as_all_splits_say():
@@ -97,6 +118,12 @@ def test_halves_of_four_robots_differ_as_all_splits_say():
     # The middle two of four scores that come in pairs are one of either pair: their mean is that of both robots.
     differences = [abs(own[half].mean() - np.delete(own, half).mean()) for half in halves]
     assert found == pytest.approx(np.median(differences))
+
+
+def test_two_robots_are_the_least_that_have_halves():
+    assert resolution(tidy("score", {"a": {"x": [0.1, 0.4]}})) == pytest.approx(0.3)
+    with pytest.raises(ValueError, match="each challenge needs at least two robots"):
+        resolution(tidy("score", {"a": {"x": [0.1, 0.4], "y": [0.2]}}))
 
 
 def test_the_resolution_is_near_that_of_normal_means():
@@ -114,6 +141,9 @@ def test_an_incomplete_table_is_refused(change):
     if change == "missing":
         with pytest.raises(ValueError, match="b lacks the score of challenge x, seed 1: methods need the same runs"):
             ranking(table.iloc[:-1])
+        table.loc[2:, "score"] = np.nan
+        with pytest.raises(ValueError, match="b lacks the score of challenge x, seed 0"):
+            ranking(table)
     elif change == "double":
         with pytest.raises(ValueError, match="b has several runs of challenge x, seed 1: keep one"):
             ranking(pd.concat([table, table.iloc[-1:]]))

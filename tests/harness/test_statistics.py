@@ -277,6 +277,60 @@ def test_margins_are_a_period_a_share_of_the_band_or_of_the_bound_and_a_hundredt
     assert margin("control_effort_rad", runs) == margin("mass", runs) == 0.0
 
 
+def test_six_robots_and_a_difference_of_the_margin_are_equivalent():
+    for margin_ in (0.5, -0.5):
+        assert paired_difference(np.full(6, 1.0 + margin_), np.ones(6), 0.5).verdict == "equivalent"
+    assert paired_difference(np.full(5, 1.1), np.ones(5), 0.5).verdict == "undecided"
+
+
+def test_shares_of_lost_runs_that_differ_by_three_points_are_equivalent():
+    first, second = np.ones((2, 100))
+    first[:3] = NEVER
+    assert paired_difference(first, second, 0.1).verdict == "equivalent"
+    first[3], second[-2:] = NEVER, NEVER  # four and two
+    assert paired_difference(first, second, 0.1).verdict == "equivalent"
+    assert paired_difference(np.where(np.arange(100) < 4, NEVER, 1.0), np.ones(100), 0.1).verdict == "undecided"
+
+
+def test_a_robot_alone_and_two_of_them_have_what_can_be_known():
+    assert paired_difference([1.0], [2.0], 0.1).probability.value == 1.0
+    two = mean_with_interval(np.array([1.0, 3.0]))
+    wanted = stats.t.interval(0.9, 1, loc=2.0)
+    assert (two.value, two.low, two.high, two.count) == pytest.approx((2.0, *wanted, 2))
+    assert median_with_interval([2.0]).count == 1
+    assert (NO_ESTIMATE.count, f"{Estimate(np.nan, np.nan, np.nan, 3):.1f}") == (0, "–")
+
+
+def test_no_share_has_an_interval_beyond_all_or_none():
+    found = [success_rate(share * count, count) for count in range(1, 300) for share in (0, 1)]
+    assert (min(each.low for each in found), max(each.high for each in found)) == (0.0, 1.0)
+
+
+def test_places_are_named_with_a_sensing_set_up_that_is_not_the_usual_one():
+    assert [statistics.place_name("p", sensing) for sensing in (None, NEVER, "position", "pixel")] == [
+        "p", "p", "p", "p pixel",
+    ]  # fmt: skip
+    runs = table(controller=["a", "b"], sensing=["position", "pixel"])
+    assert statistics.with_places(runs)["plant"].tolist() == ["p", "p pixel"]
+    assert statistics.with_places(runs[:1])["plant"].tolist() == ["p"]
+    assert statistics.shown_value(2.5) == "2.5"
+
+
+def test_a_curve_is_followed_up_to_two_bands_and_moves_count_in_percent():
+    runs = table(
+        controller=["a", "b"], task_kind=["curve"] * 2, rms_error_evaluated=[0.01, 0.0101], settling_band=0.005
+    )
+    assert outcomes(runs).tolist() == ["followed", "not_followed"]
+    assert statistics.settled_share(table(controller=list("ab"), settling_time_s=[1.0, NEVER])).value == 50.0
+
+
+def test_a_margin_is_of_the_longest_period_the_widest_band_and_the_best_bound():
+    runs = table(controller=["calibrated", "nmpc_calibrated"], settling_band=[0.005, 0.05], period_s=[0.1, 0.2])
+    assert margin("settling_time_s", runs) == 0.2
+    assert margin("rms_error_evaluated", runs) == pytest.approx(2e-3)
+    assert margin("rms_error_evaluated", runs.assign(rms_error_evaluated=[0.03, 0.05])) == pytest.approx(3e-3)
+
+
 @pytest.mark.parametrize(
     ("pairs", "change", "message"),
     [
