@@ -149,8 +149,6 @@ class Identified:
 
 def motion(log: Log) -> Any:  # noqa: ANN401 - of SciPy
     """Return the joint positions of a log as a function of time."""
-    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - a quarter of a second
-
     return CubicSpline(log.time, log.joints)
 
 

@@ -1,12 +1,13 @@
 """Mistakes of a log that stop people: joints in another order or direction, other units, mirrored axes, clocks.
 
 A log that the robot's model explains down to its noise, with likely parameters, has none of them. Of any other log
-each mistake is undone in turn, and named where the log is explained far better without it.
+each mistake is undone in turn, then each pair, and named where the log is explained far better without it.
 """
 
 import math
 from collections.abc import Iterator, Mapping
-from itertools import combinations, product
+from heapq import nsmallest
+from itertools import combinations, islice, product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, ab
 REFUSED_SHARE: Final = 0.1  # [1] of the motion of features, from which errors that nothing explains are refused
 MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
 GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a log
+PAIR_GAIN: Final = 0.5  # [1] of what one mistake leaves, below which two explain it
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
 SCREENED: Final = 6  # mistakes that are looked at closely
 FRAMES: Final = 150  # frames of a close look
@@ -61,7 +63,9 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
     found = _drift(log, robot)
     if not is_explained(log, robot):
         known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
-        found = _undone(log, model, others, known) or found or _large_errors(log, robot)
+        found = _undone(log, model, others, known) or found
+        if not found and (large := _large_errors(log, robot)):
+            found = next(filter(None, (_undone(half, model, others, {}) for half, _ in _halves(log))), large)
     return found, None if found else robot
 
 
@@ -155,8 +159,8 @@ def _large_errors(log: Log, robot: Identified) -> str:
     if share < REFUSED_SHARE or _is_noise(log, robot):
         return ""
     return (
-        f"errors are {share:.0%} of the motion, and no single mistake explains them: there may be two; check order, "
-        "directions and zeros of the joints, the axes of the camera, and whether it was moved"
+        f"errors are {share:.0%} of the motion, and neither one mistake nor two explain them: check order, directions "
+        "and zeros of the joints, the axes of the camera, and whether it was moved"
     )
 
 
@@ -178,9 +182,8 @@ def _drift(log: Log, robot: Identified) -> str:
 def _moved(log: Log, model: RobotModel) -> str:
     """Name a camera that was moved during the log: one half is explained, and errors of its robot jump in the other."""
     rows = frames_of(log)
-    for half, way in ((rows[: len(rows) // 2], 1), (rows[len(rows) // 2 :], -1)):
-        part = log._replace(valid=np.isin(np.arange(len(log.time)), half))
-        if len(half) < MIN_FRAMES or not is_explained(part, robot := identify(part, model)):
+    for half, way in _halves(log):
+        if not is_explained(half, robot := identify(half, model)):
             continue
         errors = np.linalg.norm(robot.errors(log, model), axis=1)
         sizes = np.array([np.median(each) for each in np.array_split(errors, PARTS)])
@@ -195,8 +198,16 @@ def _moved(log: Log, model: RobotModel) -> str:
     return ""
 
 
+def _halves(log: Log) -> Iterator[tuple[Log, int]]:
+    """Yield the log with the frames of a half each, where these are enough, and on which side the other one is."""
+    rows = frames_of(log)
+    for half, way in ((rows[: len(rows) // 2], 1), (rows[len(rows) // 2 :], -1)):
+        if len(half) >= MIN_FRAMES:
+            yield log._replace(valid=np.isin(np.arange(len(log.time)), half)), way
+
+
 def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known: Mapping[str, float]) -> str:
-    """Return the mistake without which the log is explained far better, with those that cannot be told from it.
+    """Return the mistake without which the log is explained far better, or two, with those not to be told from it.
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
@@ -216,15 +227,27 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
         error = np.minimum(np.sum((robot.residuals / noise) ** 2, axis=1), OUTLIER * len(noise))
         return float(error.sum()) + sum(size**2 for size in robot.sizes().values())
 
-    tried = sorted(_remedies(log, model, others), key=quick)[:SCREENED]
-    as_it_is, misfits = misfit(_Remedy("", log, model), known), [misfit(each) for each in tried]
-    best = min(misfits)
-    if best >= (TIE if known else GAIN) * as_it_is:
+    as_it_is = least = misfit(_Remedy("", log, model), known)
+    names: list[str] = []
+    for remedies, gain in ((_remedies, TIE if known else GAIN), (_pairs, 0.0 if known else PAIR_GAIN)):
+        tried = nsmallest(SCREENED, remedies(log, model, others), key=quick) if gain else []
+        found = sorted((misfit(each), each.text) for each in tried)
+        if tried and found[0][0] < gain * least:
+            least = found[0][0]
+            names = [text for own, text in found if own <= TIE * least]
+        if names and least < UNEXPLAINED**2 * log.spec.m * len(rows):
+            break
+    if not names:
         return ""
-    names = [each.text for _, each in sorted(zip(misfits, tried, strict=True), key=lambda pair: pair[0])]
-    names = names[: sum(own <= TIE * best for own in misfits)]
     which = "; a log cannot tell which" if len(names) > 1 else ""
-    return f"{', or '.join(names)} (undone, {math.sqrt(best / max(best, as_it_is)):.0%} of the error is left{which})"
+    return f"{', or '.join(names)} (undone, {math.sqrt(least / max(least, as_it_is)):.0%} of the error is left{which})"
+
+
+def _pairs(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:
+    """Yield the log without two mistakes each."""
+    for k, one in enumerate(_remedies(log, model, others)):
+        for other in islice(_remedies(one.log, one.model, others), k + 1, None):
+            yield other._replace(text=f"{one.text}, and {other.text}")
 
 
 def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:

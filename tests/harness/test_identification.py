@@ -306,11 +306,25 @@ def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, 
 
 
 @pytest.mark.slow
-def test_a_log_that_no_single_mistake_explains_is_refused():
+def test_two_mistakes_are_named_together_and_more_of_them_refused():
     log, _, model = logged()
     order = np.argsort(np.argsort(log.spec.joint_names))
-    text, robot = mistakes(log._replace(joints=log.joints[:, order], features=log.features * (1, 1, -1)), model, {})
-    assert "of the motion, and no single mistake explains them: there may be two" in text
+    both = log._replace(joints=log.joints[:, order], features=log.features * (1, 1, -1))
+    text, robot = mistakes(both, model, {})
+    assert text.startswith("joints are in alphabetical order, as in ROS, and an axis of the camera is mirrored")
+    assert robot is None
+    three = both._replace(joints=both.joints * (1, 1, 1, -1, 1, 1) + (0, 0, np.pi / 2, 0, 0, 0))
+    text, robot = mistakes(three, model, {})
+    assert "of the motion, and neither one mistake nor two explain them" in text
+    assert robot is None
+
+
+@pytest.mark.slow
+def test_a_mistake_is_named_although_the_camera_was_moved_too():
+    log, _, model = logged()
+    moved = log.features + 0.05 * (log.time[:, None] > 0.5 * log.time[-1]) * (1, 0, 0)
+    text, robot = mistakes(log._replace(joints=log.joints * (1, 1, -1, 1, 1, 1), features=moved), model, {})
+    assert text.startswith(f"the direction of joint {log.spec.joint_names[2]} is reversed (undone, ")
     assert robot is None
 
 
