@@ -59,12 +59,14 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     ),
     "results": (
         ("harness/batch/results.py", "harness/batch/tables.py"),
-        ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
+        ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py",
+         "harness/test_foreign_folders.py"),
     ),
     "folders": (
         ("harness/batch/tables.py", "plant/contract/checksums.py", "harness/batch/integrity.py",
          "harness/batch/results.py"),
-        ("plant/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
+        ("plant/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py",
+         "harness/test_foreign_folders.py"),
     ),
 }  # fmt: skip
 BROKEN = 77  # exit code of a mutant that could not be put in place

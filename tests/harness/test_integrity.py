@@ -146,6 +146,41 @@ DAMAGES = {
 }
 
 
+def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damaged(half, tmp_path):
+    folder, other = copy(half, tmp_path), tmp_path / "other"
+    results.create_folder(other, {"schema_version": "4"})
+    results.copy_parts([(folder, 0), (folder, 8)], other)
+    assert results.part_indices(other) == [0, 8]
+    assert not (other / results.PICTURES).exists()
+    runs = pd.read_parquet(folder / results.part_name(0, results.RUNS))["run_id"]
+    (folder / results.PICTURES).mkdir()
+    for name in (runs[0], "another"):
+        (folder / results.PICTURES / f"{name}.png").write_text(name)
+    for _ in range(2):
+        results.copy_parts([(folder, 0)], other)
+        assert [path.name for path in (other / results.PICTURES).iterdir()] == [f"{runs[0]}.png"]
+    assert {results.part_name(0, results.RUNS), f"{results.PICTURES}/{runs[0]}.png"} <= read_sums(other).keys()
+    flip(folder / results.part_name(8, results.RUNS))
+    with pytest.raises(DamagedFile, match=r"00000008\.runs\.parquet was changed"):
+        results.copy_parts([(folder, 8)], other)
+
+
+def test_more_runs_than_were_asked_for_are_of_another_folder():
+    assert results.missing_line(3, 3) == ""
+    assert results.missing_line(2, 3) == "2 of 3 runs are there: --resume carries out the others"
+    assert results.missing_line(4, 3).startswith("4 runs are there, and the manifest is of 3: a file of another folder")
+    assert results.missing_line(4, 0) == ""  # a folder that says nothing
+
+
+def test_examined_files_are_counted_with_parts_and_what_stands_beside(half, tmp_path):
+    folder = copy(half, tmp_path)
+    before = examine(folder)
+    assert (before.files, before.left_out) == (1 + len([*(folder / results.PARTS).glob("[0-9]*.*")]), [])
+    (folder / "report.html").write_text("mine")
+    results.vouch(folder, [folder / "report.html"])
+    assert examine(folder).files == before.files + 1
+
+
 @pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, whole, tmp_path, what):
     folder = copy(half, tmp_path)
