@@ -199,7 +199,7 @@ def _moved(log: Log, model: RobotModel) -> str:
 
 
 def _halves(log: Log) -> Iterator[tuple[Log, int]]:
-    """Yield the log with the frames of a half each, where these are enough, and on which side the other one is."""
+    """Yield the log with the frames of each half, if they are enough, and the direction of the other half, 1 or −1."""
     rows = frames_of(log)
     for half, way in ((rows[: len(rows) // 2], 1), (rows[len(rows) // 2 :], -1)):
         if len(half) >= MIN_FRAMES:
@@ -207,7 +207,7 @@ def _halves(log: Log) -> Iterator[tuple[Log, int]]:
 
 
 def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known: Mapping[str, float]) -> str:
-    """Return the mistake without which the log is explained far better, or two, with those not to be told from it.
+    """Name the one or two mistakes without which the log is explained far better, and others that do so as well.
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
@@ -229,10 +229,11 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
 
     as_it_is = least = misfit(_Remedy("", log, model), known)
     names: list[str] = []
-    for remedies, gain in ((_remedies, TIE if known else GAIN), (_pairs, 0.0 if known else PAIR_GAIN)):
-        tried = nsmallest(SCREENED, remedies(log, model, others), key=quick) if gain else []
+    stages = ((_remedies, TIE),) if known else ((_remedies, GAIN), (_pairs, PAIR_GAIN))
+    for remedies, gain in stages:
+        tried = nsmallest(SCREENED, remedies(log, model, others), key=quick)
         found = sorted((misfit(each), each.text) for each in tried)
-        if tried and found[0][0] < gain * least:
+        if found[0][0] < gain * least:
             least = found[0][0]
             names = [text for own, text in found if own <= TIE * least]
         if names and least < UNEXPLAINED**2 * log.spec.m * len(rows):
