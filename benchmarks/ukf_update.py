@@ -13,14 +13,13 @@ from functools import partial
 import numpy as np
 
 from measuring import asked_to_be_quick, table, times_in_turns
-from servobench.controllers.estimators.kalman import sigma_weights, split_update, unscented_update
+from servobench.controllers.estimators.kalman import split_update, unscented_update
 
 M, N, MOTIONS, FACTOR, BLOCK = 3, 6, 200, 8.0, 128
 SIZE = M * N
-P0, q, r = 1e-2 * np.eye(SIZE), 4e-4, 2e-6
+P0, q, r = 1e-2 * np.eye(SIZE), 4e-4, np.float64(2e-6)
 Q, R = q * np.eye(SIZE), r * np.eye(M)
 BESIDE = f"split form, {BLOCK} runs side by side"
-WEIGHTS = sigma_weights(SIZE, 1.0, 2.0, 0.0)
 
 
 def motions() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -35,7 +34,7 @@ def sigma_points(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Run the project's sigma-point filter and return vec(J)."""
     J, P = np.zeros((M, N)), P0
     for dq, dy in data:
-        J, P = unscented_update(J, P, dq, dy, Q=Q, R=R, weights=WEIGHTS)
+        J, P = unscented_update(J, P + Q, dq, dy, r=r, spread=(1.0, 2.0, 0.0))
     return J.ravel()
 
 
@@ -43,7 +42,7 @@ def split(data: list[tuple[np.ndarray, np.ndarray]], lead: tuple[int, ...] = ())
     """Run the project's split filter for runs side by side, or for one, and return vec(J) of the first."""
     J, P = np.zeros((*lead, M, N)), np.broadcast_to(P0[:N, :N], (*lead, N, N)).copy()
     for dq, dy in data:
-        J, P = split_update(J, P, np.tile(dq, (*lead, 1)), np.tile(dy, (*lead, 1)), q=q, r=r)
+        J, P = split_update(J, P + q * np.eye(N), np.tile(dq, (*lead, 1)), np.tile(dy, (*lead, 1)), r=r)
     return J.reshape(-1, SIZE)[0]
 
 

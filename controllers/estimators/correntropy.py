@@ -19,29 +19,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, Update, cholesky_of
+from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of, joseph, symmetric
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, outer, transposed
+from servobench.plant.contract.lanes import branch, norm, outer
 from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
 MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is practically 0, but can be divided by
 MIN_ERROR: Final = 0.1  # [1] smallest |e| of the generalised kernel, in standard deviations
-
-
-def _by_rows(config: RandomWalk, correction: Update) -> RandomWalkEstimator:
-    """Return the estimator that adds the walk to the covariance of each row, and then corrects.
-
-    The correction is called as `kalman.split_update`, with P (..., m, n, n) after the walk and without q.
-    """
-
-    def update(
-        J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        P = P + q[..., None, None, None] * np.eye(P.shape[-1])
-        return correction(J, P, joint_step, feature_step, r=np.broadcast_to(r, q.shape)[()])
-
-    return RandomWalkEstimator(config, update, "by_rows")
 
 
 def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
@@ -61,12 +46,10 @@ def weighted_gain(
 def corrected(
     J: FloatArray, P: FloatArray, gain: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `_by_rows`."""
+    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form."""
     dq = joint_step[..., None, :]
-    A = P - outer(gain, np.matvec(P, dq))
-    P = A + outer(r[..., None, None] * gain - np.matvec(A, dq), gain)
-    innovation = feature_step - np.matvec(J, joint_step)
-    return J + innovation[..., None] * gain, (P + transposed(P)) / 2
+    P = symmetric(joseph(P, np.matvec(P, dq), gain, dq, r[..., None]))
+    return J + (feature_step - np.matvec(J, joint_step))[..., None] * gain, P
 
 
 class Iterate(NamedTuple):
@@ -95,8 +78,8 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `_by_rows`, as for the others up to `r`.
-        P: its covariance.
+        J: J⁻; see `kalman.split_update`, as for the others up to `r`.
+        P: covariance of each row after the walk, (..., m, n, n).
         joint_step: Δq.
         feature_step: Δy.
         r: variance of each component of Δy.
@@ -180,7 +163,7 @@ def _by_fixed_point(
     config: MckfConfig | GmckfConfig, weight: Callable[[FloatArray], FloatArray]
 ) -> RandomWalkEstimator:
     update = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return _by_rows(config, update)
+    return RandomWalkEstimator(config, update, "by_rows")
 
 
 def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
@@ -210,12 +193,11 @@ class ImcckfConfig(RandomWalk):
 def imcckf_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `_by_rows`."""
+    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
     PH, gain = weighted_gain(P, joint_step, weight, r)
-    P = P - outer(gain, PH)
-    return J + innovation[..., None] * gain, (P + transposed(P)) / 2
+    return J + innovation[..., None] * gain, symmetric(P - outer(gain, PH))
 
 
 def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
@@ -227,7 +209,7 @@ def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = No
 
         λ = G(‖Δy − H x⁻‖_R⁻¹),   K = λ P⁻ Hᵀ (λ H P⁻ Hᵀ + R)⁻¹,   x = x⁻ + K (Δy − H x⁻),   P = (I − K H) P⁻
     """
-    return _by_rows(config, partial(imcckf_update, bandwidth=config.bandwidth))
+    return RandomWalkEstimator(config, partial(imcckf_update, bandwidth=config.bandwidth), "by_rows")
 
 
 @settings
@@ -250,7 +232,7 @@ def rmckf_update(
     bandwidth: float,
     regularisation: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `_by_rows`."""
+    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(innovation / np.sqrt(r)[..., None], bandwidth) + regularisation
     _, gain = weighted_gain(P, joint_step, weight, r)
@@ -271,4 +253,4 @@ def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None
     annealing of the bandwidth, off in their settings, is left out.
     """
     update = partial(rmckf_update, bandwidth=config.bandwidth, regularisation=config.regularisation)
-    return _by_rows(config, update)
+    return RandomWalkEstimator(config, update, "by_rows")

@@ -30,7 +30,7 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Literal, NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -82,83 +82,59 @@ def cholesky_of(P: FloatArray) -> FloatArray:
     return L
 
 
-def measurement_matrix(joint_step: FloatArray, m: int) -> FloatArray:
-    """Return H = I_m ⊗ Δqᵀ, (..., m, mn), for Δq (..., n)."""
-    H = np.zeros((*joint_step.shape[:-1], m, m, joint_step.shape[-1]))
-    for i in range(m):
-        H[..., i, i, :] = joint_step
-    return H.reshape(*H.shape[:-2], -1)
+def joseph(P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray, r: FloatArray) -> FloatArray:
+    """Return (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ, (..., n, n), for PH = PΔq, K and Δq, (..., n), and r, (...).
+
+    With A = P − K PHᵀ it is multiplied out: A − (A Δq) Kᵀ + r K Kᵀ.
+    """
+    A = P - outer(K, PH)
+    return np.asarray(A + outer(r[..., None] * K - np.matvec(A, joint_step), K))
+
+
+def symmetric(P: FloatArray) -> FloatArray:
+    """Return (P + Pᵀ)/2, (..., n, n), of which rounding is removed."""
+    return np.asarray((P + transposed(P)) / 2)
 
 
 def kalman_update(
-    x: FloatArray, P: FloatArray, H: FloatArray, z: FloatArray, *, Q: FloatArray, R: FloatArray
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict a random walk and correct it by one measurement, covariance in Joseph form.
-
-    Args:
-        x: state, (..., s).
-        P: its covariance, (..., s, s).
-        H: measurement matrix, (..., m, s).
-        z: measurement, (..., m).
-        Q: process covariance, (..., s, s).
-        R: measurement covariance, (..., m, m).
-
-    Returns:
-        The new state and covariance.
-    """
-    P = P + Q
-    HP = H @ P
-    K = transposed(np.linalg.solve(HP @ transposed(H) + R, HP))
-    A = np.eye(x.shape[-1]) - K @ H
-    P = A @ P @ transposed(A) + K @ R @ transposed(K)
-    return x + np.matvec(K, z - np.matvec(H, x)), (P + transposed(P)) / 2
-
-
-def split_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Do the same for P = I_m ⊗ P_n, Q = q I, R = r I: all rows of J share the gain K (n,).
-
-        P ← P + q I,   K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
+    """Correct vec(J) by one motion, as printed: K = P Hᵀ (H P Hᵀ + R)⁻¹, covariance in Joseph form.
 
     Args:
         J: Jacobian, (..., m, n), m/rad.
-        P: covariance of each of its rows, (..., n, n), (m/rad)².
+        P: covariance of vec(J) by rows after the walk, (..., mn, mn), (m/rad)².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
-        q: variance of the walk, (...), (m/rad)².
         r: variance of Δy, (...), m².
 
     Returns:
         The new Jacobian and covariance.
     """
-    P = plus_diagonal(P, q[..., None])
+    *lead, m, n = J.shape
+    x, H = J.reshape(*lead, m * n), np.einsum("ij,...k->...ijk", np.eye(m), joint_step).reshape(*lead, m, m * n)
+    HP, R = H @ P, r[..., None, None] * np.eye(m)
+    K = transposed(np.linalg.solve(HP @ transposed(H) + R, HP))
+    A = np.eye(m * n) - K @ H
+    P = A @ P @ transposed(A) + K @ R @ transposed(K)
+    return (x + np.matvec(K, feature_step - np.matvec(H, x))).reshape(J.shape), symmetric(P)
+
+
+def split_update(
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Do the same where P = I_m ⊗ P_n: all rows of J share the gain K, (n,), and the covariance P_n, (..., n, n).
+
+    K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
+    """
     PH = np.matvec(P, joint_step)
     K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
-    # (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ with A = P − K PHᵀ multiplied out: A − (A Δq) Kᵀ + r K Kᵀ
-    A = P - outer(K, PH)
-    P = A + outer(r[..., None] * K - np.matvec(A, joint_step), K)
-    return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
-
-
-def full_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Do the same by `kalman_update`, for P, (..., mn, mn), of all entries."""
-    H = measurement_matrix(joint_step, J.shape[-2])
-    x, P = kalman_update(J.reshape(*J.shape[:-2], -1), P, H, feature_step, **full_covariances(J, q, r))
-    return x.reshape(J.shape), P
-
-
-def full_covariances(J: FloatArray, q: FloatArray, r: FloatArray) -> dict[str, FloatArray]:
-    """Return Q = q I, (..., mn, mn), and R = r I, (..., m, m), by name, for J (..., m, n)."""
-    m, n = J.shape[-2:]
-    return {"Q": q[..., None, None] * np.eye(m * n), "R": r[..., None, None] * np.eye(m)}
+    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(joseph(P, PH, K, joint_step, r))
 
 
 Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
-"""The formula by which a filter corrects the Jacobian and its covariance, called as `split_update`; the shape of P
-depends on the filter, see `Covariance`."""
+"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `split_update`; the
+shape of P depends on the filter, see `Covariance`."""
 Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
 """One P, (n, n), that all rows of J share; one of each row, (m, n, n); or one of all entries, (mn, mn)."""
 
@@ -195,8 +171,10 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         noise: FloatArray = self._noise if motion.noise is None else motion.noise
-        q, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
-        J, P = self._formula(state.J, state.P, motion.joint_step, motion.feature_step, q=q, r=r)
+        walk = self._walk * np.asarray(motion.duration)
+        P = plus_diagonal(state.P, np.expand_dims(walk, tuple(range(walk.ndim, state.P.ndim - 1))))
+        r = np.broadcast_to(2.0 * noise * noise, walk.shape)[()]
+        J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
         cholesky_of(P)
         return state._replace(J=J, P=P)
 
@@ -215,7 +193,7 @@ def kalman_estimator(config: KalmanConfig, knowledge: RobotKnowledge | None = No
     """
     if config.form == "split":
         return RandomWalkEstimator(config, split_update, "shared")
-    return RandomWalkEstimator(config, full_update, "full")
+    return RandomWalkEstimator(config, kalman_update, "full")
 
 
 @settings
@@ -258,29 +236,24 @@ def unscented_update(
     joint_step: FloatArray,
     feature_step: FloatArray,
     *,
-    Q: FloatArray,
-    R: FloatArray,
-    weights: SigmaWeights,
+    r: FloatArray,
+    spread: tuple[float, float, float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict the random walk and correct it by one motion with sigma points.
+    """Correct vec(J) by one motion with sigma points; see `kalman_update`.
 
     Args:
-        J: Jacobian, (..., m, n), m/rad.
-        P: covariance of vec(J) by rows, (..., mn, mn), (m/rad)².
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        Q: process covariance, (..., mn, mn), (m/rad)².
-        R: covariance of Δy, (..., m, m), m².
-        weights: from `sigma_weights` with s = mn.
-
-    Returns:
-        The new Jacobian and covariance.
+        J: as there, like the others up to `r`.
+        P: after the walk.
+        joint_step: Δq.
+        feature_step: Δy.
+        r: variance of Δy.
+        spread: α, β and κ.
 
     Raises:
-        FilterDiverged: P + Q is not positive definite.
+        FilterDiverged: P is not positive definite.
     """
     *lead, m, n = J.shape
-    size, P = m * n, P + Q
+    size, weights = m * n, sigma_weights(m * n, *spread)
     reach = weights.reach * transposed(cholesky_of(P))
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
@@ -288,11 +261,11 @@ def unscented_update(
     z = np.vecmat(weights.mean, Z)
     deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
-    S = transposed(deviations) @ weighted + R
+    S = transposed(deviations) @ weighted + r[..., None, None] * np.eye(m)
     C = transposed(offsets) @ weighted
     K = transposed(np.linalg.solve(S, transposed(C)))
     P = P - K @ transposed(C)  # K S = C
-    return J + np.matvec(K, feature_step - z).reshape(J.shape), (P + transposed(P)) / 2
+    return J + np.matvec(K, feature_step - z).reshape(J.shape), symmetric(P)
 
 
 def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
@@ -303,14 +276,8 @@ def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) ->
     """
     if config.form == "split":
         return RandomWalkEstimator(config, split_update, "shared")
-
-    def update(
-        J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        weights = sigma_weights(P.shape[-1], config.alpha, config.beta, config.kappa)
-        return unscented_update(J, P, joint_step, feature_step, **full_covariances(J, q, r), weights=weights)
-
-    return RandomWalkEstimator(config, update, "full")
+    spread = config.alpha, config.beta, config.kappa
+    return RandomWalkEstimator(config, partial(unscented_update, spread=spread), "full")
 
 
 @settings
@@ -352,9 +319,8 @@ def rls_update(
     """
     PH = np.matvec(P, joint_step)
     K = PH / (forgetting + np.vecdot(joint_step, PH))[..., None]
-    A = P - outer(K, PH)
-    P = (A + outer(forgetting[..., None] * K - np.matvec(A, joint_step), K)) / forgetting[..., None, None]
-    return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
+    P = joseph(P, PH, K, joint_step, forgetting) / forgetting[..., None, None]
+    return J + outer(feature_step - np.matvec(J, joint_step), K), symmetric(P)
 
 
 @final
