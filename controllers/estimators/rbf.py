@@ -13,7 +13,7 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import FeatureMemo, JacobianNetwork
+from servobench.controllers.networks.rbf import FeatureMemo
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
@@ -55,23 +55,6 @@ def window_step(
     return np.where(total > 0.0, k2 / np.where(total > 0.0, total, 1.0), 0.0)[()]
 
 
-def started_rows(network: JacobianNetwork, jacobian: FloatArray) -> FloatArray:
-    """Return the offline weights by rows of the Jacobian for every lane, (..., m, n, L), m/rad.
-
-    Args:
-        network: the offline network.
-        jacobian: Ĵ₀, (..., m, n); only its shape counts. The network is itself the initial Jacobian, for all
-            joint positions; one matrix without its joint position holds less.
-
-    Raises:
-        ValueError: `jacobian` is of another size than the network.
-    """
-    *lead, m, n = jacobian.shape
-    if (m, n) != (network.m, network.n):
-        raise ValueError(f"jacobian must have shape {(network.m, network.n)}, got {(m, n)}")
-    return np.broadcast_to(network.rows, (*lead, *network.rows.shape))
-
-
 class RbfState(NamedTuple):
     """The state of the update; the window holds the T − 1 motions before the next one, the newest last."""
 
@@ -105,6 +88,11 @@ class NetworkEstimator(Estimator[NetworkState]):
         self._network = networks.jacobian
         self._features = FeatureMemo(self._network)
 
+    def _started(self, jacobian: FloatArray) -> FloatArray:
+        """Return the offline weights, (..., m, n, L); Ĵ₀, which holds for one joint position alone, is left out."""
+        rows: FloatArray = self._network.rows
+        return np.broadcast_to(rows, (*jacobian.shape[:-2], *rows.shape))
+
     def deviation(self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray) -> FloatArray:
         """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
         return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
@@ -136,11 +124,10 @@ class RbfEstimator(NetworkEstimator[RbfState]):
     _config: RbfConfig
 
     def start(self, jacobian: FloatArray) -> RbfState:
-        """Start from the offline network; see `started_rows`."""
-        rows, window = started_rows(self._network, jacobian), self._config.window
-        lead, (layers, units) = jacobian.shape[:-2], self._network.layers
+        """Start from the offline network, whatever Ĵ₀ is."""
+        lead, window, (layers, units) = jacobian.shape[:-2], self._config.window, self._network.layers
         return RbfState(
-            rows=rows,
+            rows=self._started(jacobian),
             theta=np.zeros((*lead, window - 1, layers, units)),
             joint_steps=np.zeros((*lead, window - 1, self._network.n)),
             feature_steps=np.zeros((*lead, window - 1, self._network.m)),
@@ -214,8 +201,8 @@ class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
     _config: RbfLyapunovConfig
 
     def start(self, jacobian: FloatArray) -> RbfLyapunovState:
-        """Start from the offline network; see `started_rows`."""
-        return RbfLyapunovState(started_rows(self._network, jacobian), np.zeros(jacobian.shape[:-1]))
+        """Start from the offline network, whatever Ĵ₀ is."""
+        return RbfLyapunovState(self._started(jacobian), np.zeros(jacobian.shape[:-1]))
 
     def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:
         """Learn from one motion."""

@@ -20,7 +20,7 @@ from annotated_types import Lt
 
 from servobench.controllers.algebra import project_to_row_space
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.laws.law import Estimate, Law, Stage
+from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
 from servobench.controllers.periods import check_preview, in_periods, sampled
@@ -191,26 +191,21 @@ class RbfnnLaw(Law[RbfnnState]):
         """Take the settings, the offline networks, limits, period and preview.
 
         Raises:
-            ValueError: a network of other sizes than the plant, or a preview shorter than the horizon.
+            ValueError: a preview shorter than the horizon.
         """
         spec, network = knowledge.spec, replace(networks.controller, offset_free=config.offset_free)
-        if (network.n, network.m) != (spec.n, spec.m):
-            raise ValueError(
-                f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
-            )
         if config.preview:
             check_preview(config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon")
         self._config = config
         self._network = network
-        own: tuple[Stage, ...] = ("preview",) if config.preview else ()
-        self.owns = frozenset(own)
+        self.owns = frozenset({"preview"}) if config.preview else frozenset()
         self._period, self._step = spec.period, network.step
         self._step_limit = spec.joint_velocity_limit * network.step
         self._share = update_share(config.k, spec.period, network.step)
         rate = in_periods(network.step, spec.period)
-        self._preview_places = _places(config.horizon + 1, rate)
-        self._error_places = _places(network.error_history, rate)
-        self._position_places = _places(network.position_history, rate)
+        self._preview_places = rate * np.arange(config.horizon + 1.0)
+        self._error_places = rate * np.arange(float(network.error_history))
+        self._position_places = rate * np.arange(float(network.position_history))
 
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
@@ -277,15 +272,12 @@ class RbfnnLaw(Law[RbfnnState]):
         α is 0 without a valid feature. Anti-windup: where the old weights exceed the limit, an update that exceeds it
         further is dropped.
         """
-        config = self._config
-        alpha = update_step(direction, ahead, self._share, config.epsilon) * valid
+        alpha = update_step(direction, ahead, self._share, self._config.epsilon) * valid
         push = controller_output(direction, ahead.xi[..., 0, :], ahead.h[..., 0, :])
-        renewed = ahead.wanted + alpha[..., None] * push
-        if not config.anti_windup:
-            return alpha, renewed
-        before = largest_excess(ahead.wanted, self._step_limit)
-        useful = (before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before)
-        alpha = alpha * useful
+        if self._config.anti_windup:
+            renewed = ahead.wanted + alpha[..., None] * push
+            before = largest_excess(ahead.wanted, self._step_limit)
+            alpha = alpha * ((before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before))
         return alpha, ahead.wanted + alpha[..., None] * push
 
 
@@ -304,11 +296,6 @@ def update_share(k: float, period: float, step: float) -> float:
     """
     steps = in_periods(period, step)
     return min(-math.expm1(steps * math.log1p(-k)) if k < 1.0 else k * steps, k)
-
-
-def _places(count: int, rate: float) -> FloatArray:
-    """Return `count` instants that lie `rate` periods apart, in periods from the first one."""
-    return np.array([rate * step for step in range(count)])
 
 
 def _rows(places: FloatArray) -> int:

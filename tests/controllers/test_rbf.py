@@ -142,12 +142,6 @@ def started_lyapunov(config, net):
     return Learning(RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n)))
 
 
-def test_an_initial_jacobian_of_another_size_is_refused():
-    for run in (started(RbfConfig(), network()), started_lyapunov(RbfLyapunovConfig(), network())):
-        with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\), got \(3, 6\)"):
-            run.estimator.start(np.zeros((3, 6)))
-
-
 def test_the_first_lyapunov_update_equals_the_one_computed_by_hand():
     net = JacobianNetwork(np.zeros((1, 1, 1)), np.ones((1, 1)), np.full((1, 1, 1), 2.0))
     estimator = started_lyapunov(RbfLyapunovConfig(n2=0.5, n3=0.1), net)
