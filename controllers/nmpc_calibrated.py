@@ -12,7 +12,6 @@ from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, S
 from servobench.controllers.periods import check_preview, in_periods, sampled, whole_periods
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import Command, Observation
 
@@ -114,16 +113,23 @@ class NmpcCalibrated(Controller):
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
-        self._program = QpProgram(self._shape, config.solver)
+        self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
         self._turn = knowledge.true_camera_turn if config.image and m == 3 else 0.0  # of points, not of pixels
         self._frames = 1 + 2 * whole_periods(0.5 * config.image_window, period)
+        self._forget()
+
+    def _forget(self) -> None:
+        n, m = self._spec.n, self._spec.m
+        self._plan: FloatArray = np.zeros((self._blocks.count, n))
+        self._sent: FloatArray = np.zeros((len(self._to_come), n))
+        self._last: FloatArray = np.zeros(n)
         self._b: FloatArray = np.zeros(m)
+        # the model counts as right until half of the offsets differ
         self._offsets: FloatArray = np.zeros((self._frames, m))
         self._past: FloatArray | None = None
-        self._plan: FloatArray = np.zeros((blocks.count, n))
-        self._sent: FloatArray = np.zeros((len(self._to_come), n))
         self._jacobian: FloatArray | None = None
-        self._forget()
+        self._fallbacks = 0
+        self._diagnostics: dict[str, float] = {}
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Forget plan, commands sent and disturbance; nothing is random.
@@ -152,12 +158,10 @@ class NmpcCalibrated(Controller):
         rows = sampled(self._fixed(reference / self._knowledge.unit, observation.time + places), self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + closed_form.decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
-        plan, success = self._improve(start, wanted)
-        limit = self._spec.joint_velocity_limit
-        velocity = np.clip(plan[0] / self._blocks.length, -limit, limit) if success else np.zeros(self._spec.n)
+        plan, limit = self._improve(start, wanted), self._spec.joint_velocity_limit
+        velocity = np.clip(plan[0] / self._blocks.length, -limit, limit)
         passed = 1.0 / self._blocks.periods  # of the first block in this period
-        later = np.concatenate([plan[1:], plan[-1:]])
-        self._plan = (1.0 - passed) * plan + passed * later if success else np.zeros_like(plan)
+        self._plan = (1.0 - passed) * plan + passed * np.concatenate([plan[1:], plan[-1:]])
         self._last = velocity * self._blocks.length
         sent = np.concatenate([self._sent, velocity[None] * self._spec.period])
         self._sent = sent[1:]
@@ -176,18 +180,6 @@ class NmpcCalibrated(Controller):
 
     def _shared(self) -> Iterable[object]:
         return self._knowledge, self._model, self._along_plan, self._shape, self._program
-
-    def _forget(self) -> None:
-        n = self._spec.n
-        self._plan = np.zeros((self._blocks.count, n))
-        self._sent = np.zeros((len(self._to_come), n))
-        self._last = np.zeros(n)
-        self._b = np.zeros(self._spec.m)
-        self._offsets = np.zeros((self._frames, self._spec.m))  # the model counts as right until half of them differ
-        self._past = None
-        self._jacobian = None
-        self._fallbacks = 0
-        self._diagnostics: dict[str, float] = {}
 
     def _observe(self, observation: Observation, feature: FloatArray) -> None:
         """Estimate b from a frame, given the feature (m,) of the model at the present joint positions."""
@@ -217,28 +209,28 @@ class NmpcCalibrated(Controller):
         feature, jacobian = self._model(joint_position)
         return np.asarray(feature)[:, 0], np.asarray(jacobian)
 
-    def _improve(self, start: FloatArray, wanted: FloatArray) -> tuple[FloatArray, bool]:
-        """Return the plan after the Gauss-Newton steps, (H, n) rad, and whether there is one.
+    def _improve(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
+        """Return the plan after the Gauss-Newton steps, (H, n) rad; rest, if there is no solution.
 
         Args:
             start: joint position at which the plan begins, (n,), rad.
             wanted: features that the model should show along the plan, (H, m), m.
         """
-        config = self._config
-        bounds = joint_bounds(
-            self._shape, self._spec, (self._last, self._change * self._spec.period), start, np.zeros(0)
-        )
+        last = self._last, self._change * self._spec.period
+        bounds = joint_bounds(self._shape, self._spec, last, start, np.zeros(0))
         plan, change, iterations = self._plan, math.inf, 0
-        while iterations < config.iterations and change > _PLAN_TOLERANCE:
+        while iterations < self._config.iterations and change > _PLAN_TOLERANCE:
             J, targets = self._linearise(start, plan, wanted)
             solution = self._program.solve(J, targets, bounds)
             if not solution.success:
-                return self._fail(solution), False
+                self._fallbacks += 1
+                self._note(solution, 0, math.nan, math.nan)
+                return np.zeros_like(plan)
             change = float(np.abs(solution.moves - plan).max())
             plan, iterations = solution.moves, iterations + 1
         terminal_error = float(np.linalg.norm(targets[-1] - J[-1] @ plan.sum(axis=0)))
         self._note(solution, iterations, change, terminal_error)
-        return plan, True
+        return plan
 
     def _linearise(self, start: FloatArray, plan: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return J (H, m, n) along the plan and the targets (H, m) that J Σ dq should meet."""
@@ -246,13 +238,6 @@ class NmpcCalibrated(Controller):
         features, jacobians = self._along_plan((start + travel).T)
         J = np.asarray(jacobians).reshape(self._spec.m, self._blocks.count, self._spec.n).swapaxes(0, 1)
         return J, wanted - np.asarray(features).T + np.einsum("tij,tj->ti", J, travel)
-
-    def _fail(self, solution: QpSolution) -> FloatArray:
-        self._fallbacks += 1
-        if self._config.fallback == "raise":
-            raise SolverFailed(f"{self._config.solver} found no solution within the limits: {solution.status}")
-        self._note(solution, 0, math.nan, math.nan)
-        return self._plan
 
     def _note(self, solution: QpSolution, iterations: int, change: float, terminal_error: float) -> None:
         self._diagnostics = {

@@ -50,7 +50,7 @@ def program(n=4, m=2, horizon=5, constant=False, move=1e3, change=1e3, view=Fals
         limit_position=True,
         view_rows=rng.normal(size=(3, m)) if view else np.zeros((0, m)),
     )
-    return QpProgram(shape, solver), shape
+    return QpProgram(shape, solver, raises=False), shape
 
 
 def make_bounds(shape, travel=1e3, margin=-1e3):

@@ -12,7 +12,6 @@ from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Sol
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, as_vector
-from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.lanes import branch, lane_by_lane, norm, transposed, where
 from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -159,7 +158,7 @@ class MpcLaw(Law[MpcState]):
             if constant
             else closed_form.UnlimitedPlan.of_free_moves(weights, self._Q)
         )
-        self._program = QpProgram(self._shape, config.solver)
+        self._program = QpProgram(self._shape, config.solver, raises=config.fallback == "raise")
 
     def start(self, observation: Observation) -> MpcState:
         """Return the state of an arm at rest."""
@@ -264,13 +263,6 @@ class MpcLaw(Law[MpcState]):
         if solution.success:
             active = np.count_nonzero(np.abs(solution.multiplier) > _MIN_MULTIPLIER)
             return solution.moves, 1.0, solution.iterations, float(active)
-        step = self._fall_back(moves[0], solution.status)
+        hold = self._config.fallback == "hold"
+        step = np.zeros(self._spec.n) if hold else scale_to_limit(moves[0], self._shape.largest_move)
         return np.tile(step, (len(moves), 1)), 0.0, solution.iterations, math.nan
-
-    def _fall_back(self, free_step: FloatArray, status: str) -> FloatArray:
-        """Return the step to send without a solution, (n,) rad."""
-        if self._config.fallback == "raise":
-            raise SolverFailed(f"{self._config.solver} found no solution within the limits: {status}")
-        if self._config.fallback == "hold":
-            return np.zeros(self._spec.n)
-        return scale_to_limit(free_step, self._shape.largest_move)

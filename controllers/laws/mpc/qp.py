@@ -27,6 +27,7 @@ import daqp
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.lanes import transposed
 from servobench.plant.contract.signals import BoolArray, PlantSpec
 
@@ -35,15 +36,9 @@ Solver: TypeAlias = Literal["daqp", "qpoases"]
 _DAQP_OPTIONS: Final = {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}
 _QPOASES_OPTIONS: Final = {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12}
 _DAQP_STATUS: Final = {
-    -1: "infeasible",
-    -2: "cycling",
-    -3: "unbounded",
-    -4: "iteration limit reached",
-    -5: "not convex",
+    -1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit reached", -5: "not convex",
     -6: "overdetermined",
-}
-
-
+}  # fmt: skip
 _any = np.logical_or.reduce  # the method `any` of an array takes twice as long
 
 
@@ -188,14 +183,15 @@ class QpProgram:
     horizon: ∫ τ α^τ target(τ) dτ.
     """
 
-    def __init__(self, shape: QpShape, solver: Solver) -> None:
+    def __init__(self, shape: QpShape, solver: Solver, *, raises: bool) -> None:
         """Build the function of the matrices.
 
         Args:
             shape: sizes, weights and the kinds of rows.
             solver: its name.
+            raises: whether `SolverFailed` is raised where there is no solution.
         """
-        self._shape = shape
+        self._shape, self._solver, self._raises = shape, solver, raises
         self._solve = _solve_daqp if solver == "daqp" else _solve_qpoases
         self._largest = np.tile(shape.largest_move, shape.moves)
         self._function = _matrices(shape)
@@ -218,6 +214,9 @@ class QpProgram:
             J: (m, n), or (H, m, n) where it varies, m/rad.
             targets: (moves, m).
             bounds: finite or infinite, lower ≤ upper.
+
+        Raises:
+            SolverFailed: there is no solution, and that is to be raised.
         """
         self._J[:], self._targets[:] = J.ravel(), targets.ravel()
         self._evaluate()
@@ -230,27 +229,24 @@ class QpProgram:
         lower, upper = np.concatenate([lower, row_lower[near]]), np.concatenate([upper, row_upper[near]])
         x, value, multiplier, status, iterations = self._solve(self._H, self._g, self._A[near], lower, upper)
         success = not status and bool(np.isfinite(x).all())
+        if self._raises and not success:
+            raise SolverFailed(f"{self._solver} found no solution within the limits: {status}")
         return QpSolution(success, x.reshape(-1, n), value + float(self._c[0]), multiplier, status, float(iterations))
 
     def _row_bounds(self, bounds: QpBounds) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of the rows in the order in which `_matrices` stacks them."""
-        shape = self._shape
-        lower: list[FloatArray] = []
-        upper: list[FloatArray] = []
-        if shape.largest_change is not None:
-            lower += [-shape.largest_change] * (shape.moves - 1)
-            upper += [shape.largest_change] * (shape.moves - 1)
+        shape, change = self._shape, self._shape.largest_change
+        rows = [(bounds.view_margin, np.full(len(shape.view_rows), math.inf))] * shape.moves
         if shape.limit_position:
-            lower += [bounds.travel_lower] * shape.moves
-            upper += [bounds.travel_upper] * shape.moves
-        lower += [bounds.view_margin] * shape.moves
-        upper += [np.full(shape.moves * len(shape.view_rows), math.inf)]
+            rows = [(bounds.travel_lower, bounds.travel_upper)] * shape.moves + rows
+        if change is not None:
+            rows = [(-change, change)] * (shape.moves - 1) + rows
+        lower, upper = zip(*rows, strict=True)
         return np.concatenate(lower), np.concatenate(upper)
 
 
-_Answer: TypeAlias = tuple[
-    FloatArray, float, FloatArray, str, int
-]  # x, criterion, multipliers, error or "", iterations
+# x, criterion, multipliers, error or "", iterations
+_Answer: TypeAlias = tuple[FloatArray, float, FloatArray, str, int]
 
 
 def _solve_daqp(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
