@@ -8,7 +8,7 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 """
 
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, final
+from typing import Annotated, Any, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -45,16 +45,20 @@ class InitialConfig:
 class InitialJacobian(ABC, Generic[State]):
     """Provides Ĵ₀, at once or after probing moves; pure, with leading axes, as estimators are."""
 
-    immediate: ClassVar[bool]  # whether Ĵ₀ is known from the start, so that `step` is never called
-    duration: int = 0  # [periods] until it is known, where no frame is lost
+    duration: int = 0  # [periods] until Ĵ₀ is known, where no frame is lost
+
+    @property
+    def immediate(self) -> bool:
+        """Whether Ĵ₀ is known from the start."""
+        return self.duration == 0
 
     @abstractmethod
     def start(self, observation: Observation) -> State:
         """Return the state at the start of a run that begins with `observation`."""
 
-    @abstractmethod
     def step(self, state: State, observation: Observation) -> tuple[State, FloatArray, BoolArray]:
         """Return the new state, a velocity (..., n) [rad/s] of a probing move, and whether Ĵ₀ is known now, (...)."""
+        return state, np.zeros_like(observation.joint_position), np.full(observation.feature.shape[:-1], True)
 
     @abstractmethod
     def jacobian(self, state: State) -> FloatArray:
@@ -64,8 +68,6 @@ class InitialJacobian(ABC, Generic[State]):
 @final
 class KnownJacobian(InitialJacobian[FloatArray]):
     """Ĵ₀ = J(q(0)) of a model, which may be constant; the state is Ĵ₀ itself."""
-
-    immediate = True
 
     def __init__(self, model: JacobianFunction, spec: PlantSpec) -> None:
         """Take the model, (..., n) rad -> (..., m, n) m/rad, and the sizes that it must have."""
@@ -82,10 +84,6 @@ class KnownJacobian(InitialJacobian[FloatArray]):
         if jacobian.shape[-2:] != self._shape:
             raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}")
         return jacobian
-
-    def step(self, state: FloatArray, observation: Observation) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return zero: nothing has to move."""
-        return state, np.zeros_like(observation.joint_position), np.full(observation.feature.shape[:-1], True)
 
     def jacobian(self, state: FloatArray) -> FloatArray:
         """Return Ĵ₀, (..., m, n), m/rad."""
@@ -113,8 +111,6 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
     rest: it ends with the wanted number of valid features.
     """
 
-    immediate = False
-
     def __init__(self, config: InitialConfig, spec: PlantSpec) -> None:
         """Plan the moves.
 
@@ -135,9 +131,8 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             )
         narrowest = float((spec.joint_upper - spec.joint_lower).min())
         if 2.0 * config.probe_step > narrowest:
-            raise ValueError(
-                f"probe_step must be at most half the joint range of {narrowest:g} rad, got {config.probe_step:g}"
-            )
+            half = f"half the joint range of {narrowest:g} rad"
+            raise ValueError(f"probe_step must be at most {half}, got {config.probe_step:g}")
 
     def start(self, observation: Observation) -> ProbeState:
         """Return the state at the first rest, which is the start of the run."""

@@ -88,12 +88,10 @@ class Servo:
     def start(self, observation: Observation) -> ServoState:
         """Return the state at the start of a run that begins with `observation`, in the unit of the plant."""
         observation = self._natural(observation)
-        initial = self.initial.start(observation)
-        lead, (m, n) = observation.feature.shape[:-1], (self.knowledge.spec.m, self.knowledge.spec.n)
-        known = self.initial.immediate
-        first = self.initial.jacobian(initial) if known else np.zeros((*lead, m, n))
-        ready, no = np.full(lead, known)[()], np.full(lead, False)[()]
-        return self._begin(ServoState(None, None, initial, None, ready, no), observation, first)  # type: ignore[arg-type]
+        initial, known = self.initial.start(observation), self.initial.immediate
+        lead, spec = observation.feature.shape[:-1], self.knowledge.spec
+        first = self.initial.jacobian(initial) if known else np.zeros((*lead, spec.m, spec.n))
+        return self._begin(initial, np.full(lead, known)[()], observation, first)
 
     def step(self, state: ServoState, observation: Observation, reference: FloatArray) -> tuple[ServoState, FloatArray]:
         """Return the new state and the joint velocity (..., n) [rad/s] for the period that begins now.
@@ -102,8 +100,7 @@ class Servo:
             ControllerDiverged: the estimate, or the command of the law, is not finite in at least one lane.
             RunFault: a part cannot go on in at least one lane.
         """
-        if self._unit != 1.0:
-            observation, reference = self._natural(observation), reference / self._unit
+        observation, reference = self._natural(observation), reference / self._unit
         if self.initial.immediate:
             return self._act((state, observation.joint_position), observation, reference)
         both = state, np.zeros_like(observation.joint_position)
@@ -112,27 +109,26 @@ class Servo:
 
     def jacobian(self, state: ServoState) -> FloatArray:
         """Return Ĵ of the last step, (..., m, n), in the unit of the plant per rad; NaN before."""
-        return state.jacobian if self._unit == 1.0 else self._unit * state.jacobian
+        return np.asarray(self._unit * state.jacobian)
 
     def _natural(self, observation: Observation) -> Observation:
-        if self._unit == 1.0:
-            return observation
         return observation.with_values(observation.joint_position, observation.feature / self._unit)
 
     def _probe(self, both: tuple[ServoState, FloatArray], observation: Observation) -> tuple[ServoState, FloatArray]:
         initial, velocity, done = self.initial.step(both[0].initial, observation)
-        state = branch(done, self._end_probing, both[0]._replace(initial=initial), observation)
-        return state, velocity
+        return branch(done, self._end_probing, both[0]._replace(initial=initial), observation), velocity
 
     def _end_probing(self, state: ServoState, observation: Observation) -> ServoState:
-        ready = np.full(observation.feature.shape[:-1], True)
-        return self._begin(state._replace(ready=ready), observation, self.initial.jacobian(state.initial))
+        return self._begin(state.initial, np.ones_like(state.ready), observation, self.initial.jacobian(state.initial))
 
-    def _begin(self, state: ServoState, observation: Observation, jacobian: FloatArray) -> ServoState:
-        return state._replace(
+    def _begin(self, initial: Any, ready: BoolArray, observation: Observation, jacobian: FloatArray) -> ServoState:  # noqa: ANN401
+        return ServoState(
             estimation=self.estimation.start(observation, jacobian),
             law=self.law.start(observation),
+            initial=initial,
             predictor=None if self.predictor is None else self.predictor.start(observation),
+            ready=ready,
+            limited=np.zeros_like(ready)[()],
         )
 
     def _act(
@@ -234,7 +230,7 @@ class ServoController(Controller):
         """Return the Jacobian (m, n) that the last step used, or None before there is one."""
         if self.state is None or np.isnan(self.state.jacobian).any():
             return None
-        return self.servo.jacobian(self.state).copy()
+        return self.servo.jacobian(self.state)
 
     def save(self) -> ServoState | None:
         """Return the state, a value that never changes."""
