@@ -13,12 +13,13 @@ from functools import partial
 import numpy as np
 
 from measuring import asked_to_be_quick, table, times_in_turns
-from servobench.controllers.estimators.kalman import split_update, unscented_update
+from servobench.controllers.estimators.kalman import UkfConfig, split_update, unscented_update
 
 M, N, MOTIONS, FACTOR, BLOCK = 3, 6, 200, 8.0, 128
 SIZE = M * N
 P0, q, r = 1e-2 * np.eye(SIZE), 4e-4, np.float64(2e-6)
 Q, R = q * np.eye(SIZE), r * np.eye(M)
+CONFIG = UkfConfig(alpha=1.0, beta=2.0, kappa=0.0)
 BESIDE = f"split form, {BLOCK} runs side by side"
 
 
@@ -34,7 +35,7 @@ def sigma_points(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Run the project's sigma-point filter and return vec(J)."""
     J, P = np.zeros((M, N)), P0
     for dq, dy in data:
-        J, P = unscented_update(J, P + Q, dq, dy, r=r, spread=(1.0, 2.0, 0.0))
+        J, P = unscented_update(J, P + Q, dq, dy, r=r, config=CONFIG)
     return J.ravel()
 
 

@@ -34,6 +34,12 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
     return np.exp(-np.minimum(error * error / (2.0 * bandwidth**2), MAX_EXPONENT))
 
 
+def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
+    """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
+    size = np.maximum(np.abs(error), MIN_ERROR)
+    return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
+
+
 def weighted_gain(
     P: FloatArray, joint_step: FloatArray, weight: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -50,6 +56,32 @@ def corrected(
     dq = joint_step[..., None, :]
     P = symmetric(joseph(P, np.matvec(P, dq), gain, dq, r[..., None]))
     return J + (feature_step - np.matvec(J, joint_step))[..., None] * gain, P
+
+
+@settings
+class MckfConfig(RandomWalk):
+    """Settings of the maximum correntropy Kalman filter (`mckf_estimator`)."""
+
+    bandwidth: Positive = 3.0
+    """[1] b, error in standard deviations at which the weight has sunk to exp(−1/2)."""
+    tolerance: Positive = 1e-6
+    """[1] the iteration ends when J changes by less than this share of its norm."""
+    iterations: Count = 20
+    """[1] the most of them in an update."""
+
+
+@settings
+class GmckfConfig(RandomWalk):
+    """Settings of the generalised maximum correntropy Kalman filter."""
+
+    shape: Positive = 1.5
+    """[1] α, exponent of the kernel: 2 is Gaussian, 1 is Laplacian."""
+    bandwidth: Positive = 4.0
+    """[1] β, error in standard deviations at which the kernel has sunk to exp(−1)."""
+    tolerance: Positive = 1e-6
+    """[1] the iteration ends when J changes by less than this share of its norm."""
+    iterations: Count = 20
+    """[1] the most of them in an update."""
 
 
 class Iterate(NamedTuple):
@@ -69,8 +101,7 @@ def fixed_point_update(
     *,
     r: FloatArray,
     weight: Callable[[FloatArray], FloatArray],
-    tolerance: float,
-    iterations: int,
+    config: MckfConfig | GmckfConfig,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion with weights of measurement and prior that belong to the corrected estimate itself.
 
@@ -84,8 +115,7 @@ def fixed_point_update(
         feature_step: Δy.
         r: variance of each component of Δy.
         weight: w, of normalised errors; above 0.
-        tolerance: of the change of J, relative.
-        iterations: the most of them.
+        config: tolerance and number of iterations.
 
     Raises:
         FilterDiverged: a covariance is not positive definite.
@@ -103,26 +133,14 @@ def fixed_point_update(
         nu = dy - np.matvec(J, dq)
         new = J + nu[..., None] * gain
         change, size = (norm(each.reshape(*each.shape[:-2], -1)) for each in (new - at.J, at.J))
-        return Iterate(new, gain, -(share * nu)[..., None] * spread, change > tolerance * size)
+        return Iterate(new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size)
 
     at = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
-    for _ in range(iterations):
+    for _ in range(config.iterations):
         if not np.any(at.moves):
             break
         at = branch(at.moves, improved, at, J, B, h, joint_step, feature_step, r)
     return corrected(J, P, at.gain, joint_step, feature_step, r=r)
-
-
-@settings
-class MckfConfig(RandomWalk):
-    """Settings of the maximum correntropy Kalman filter (`mckf_estimator`)."""
-
-    bandwidth: Positive = 3.0
-    """[1] b, error in standard deviations at which the weight has sunk to exp(−1/2)."""
-    tolerance: Positive = 1e-6
-    """[1] the iteration ends when J changes by less than this share of its norm."""
-    iterations: Count = 20
-    """[1] the most of them in an update."""
 
 
 def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
@@ -136,34 +154,8 @@ def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) 
 
     until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
     """
-    return _by_fixed_point(config, partial(gaussian_weight, bandwidth=config.bandwidth))
-
-
-@settings
-class GmckfConfig(RandomWalk):
-    """Settings of the generalised maximum correntropy Kalman filter."""
-
-    shape: Positive = 1.5
-    """[1] α, exponent of the kernel: 2 is Gaussian, 1 is Laplacian."""
-    bandwidth: Positive = 4.0
-    """[1] β, error in standard deviations at which the kernel has sunk to exp(−1)."""
-    tolerance: Positive = 1e-6
-    """[1] the iteration ends when J changes by less than this share of its norm."""
-    iterations: Count = 20
-    """[1] the most of them in an update."""
-
-
-def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
-    """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
-    size = np.maximum(np.abs(error), MIN_ERROR)
-    return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
-
-
-def _by_fixed_point(
-    config: MckfConfig | GmckfConfig, weight: Callable[[FloatArray], FloatArray]
-) -> RandomWalkEstimator:
-    update = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return RandomWalkEstimator(config, update, "by_rows")
+    weight = partial(gaussian_weight, bandwidth=config.bandwidth)
+    return RandomWalkEstimator(config, partial(fixed_point_update, weight=weight, config=config), "by_rows")
 
 
 def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
@@ -179,7 +171,8 @@ def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None
     factor |e|^(α−2) has no finite or no positive value at e = 0, where the iteration begins: |e| is taken as at least
     `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
     """
-    return _by_fixed_point(config, partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth))
+    weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
+    return RandomWalkEstimator(config, partial(fixed_point_update, weight=weight, config=config), "by_rows")
 
 
 @settings
@@ -229,12 +222,11 @@ def rmckf_update(
     feature_step: FloatArray,
     *,
     r: FloatArray,
-    bandwidth: float,
-    regularisation: float,
+    config: RmckfConfig,
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
-    weight = gaussian_weight(innovation / np.sqrt(r)[..., None], bandwidth) + regularisation
+    weight = gaussian_weight(innovation / np.sqrt(r)[..., None], config.bandwidth) + config.regularisation
     _, gain = weighted_gain(P, joint_step, weight, r)
     return corrected(J, P, gain, joint_step, feature_step, r=r)
 
@@ -252,5 +244,4 @@ def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None
     Departures: their law multiplies each feature's error by the same weight, which no estimator can do here, and their
     annealing of the bandwidth, off in their settings, is left out.
     """
-    update = partial(rmckf_update, bandwidth=config.bandwidth, regularisation=config.regularisation)
-    return RandomWalkEstimator(config, update, "by_rows")
+    return RandomWalkEstimator(config, partial(rmckf_update, config=config), "by_rows")

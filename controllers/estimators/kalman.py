@@ -231,13 +231,7 @@ def sigma_weights(size: int, alpha: float, beta: float, kappa: float) -> SigmaWe
 
 
 def unscented_update(
-    J: FloatArray,
-    P: FloatArray,
-    joint_step: FloatArray,
-    feature_step: FloatArray,
-    *,
-    r: FloatArray,
-    spread: tuple[float, float, float],
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, config: UkfConfig
 ) -> tuple[FloatArray, FloatArray]:
     """Correct vec(J) by one motion with sigma points; see `kalman_update`.
 
@@ -247,13 +241,13 @@ def unscented_update(
         joint_step: Δq.
         feature_step: Δy.
         r: variance of Δy.
-        spread: α, β and κ.
+        config: α, β and κ.
 
     Raises:
         FilterDiverged: P is not positive definite.
     """
     *lead, m, n = J.shape
-    size, weights = m * n, sigma_weights(m * n, *spread)
+    size, weights = m * n, sigma_weights(m * n, config.alpha, config.beta, config.kappa)
     reach = weights.reach * transposed(cholesky_of(P))
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
@@ -276,8 +270,7 @@ def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) ->
     """
     if config.form == "split":
         return RandomWalkEstimator(config, split_update, "shared")
-    spread = config.alpha, config.beta, config.kappa
-    return RandomWalkEstimator(config, partial(unscented_update, spread=spread), "full")
+    return RandomWalkEstimator(config, partial(unscented_update, config=config), "full")
 
 
 @settings

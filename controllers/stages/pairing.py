@@ -20,8 +20,10 @@ the motions that the delay pairs then gives the Jacobian.
 """
 
 import math
+import operator
 from collections.abc import Iterable
-from typing import Final, NamedTuple, Self, cast, final
+from functools import reduce
+from typing import Final, NamedTuple, Self, TypeAlias, cast, final
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +59,7 @@ REST_DEVIATION: Final = 0.2  # [m/rad] of an entry of E at first
 REST_WALK: Final = 0.1  # [m/rad/√rad] u, of an entry of E
 MODEL_ERROR: Final = 0.05  # [1] share of ‖x‖ that M and E do not explain
 MAP_DEVIATION: Final = 0.55  # [1] of an entry of M at first; larger ones favour late delays while an arm speeds up
+FeatureMotion: TypeAlias = tuple[FloatArray, FloatArray, BoolArray]  # the first three of `Paired`
 
 
 @final
@@ -114,10 +117,7 @@ class Candidates:
 
 def weighted(weights: Iterable[FloatArray], rows: Iterable[FloatArray]) -> FloatArray:
     """Return Σ_i w_i x_i."""
-    first, *others = (weight * row for weight, row in zip(weights, rows, strict=True))
-    for each in others:
-        first = first + each
-    return first
+    return reduce(operator.add, map(operator.mul, weights, rows))
 
 
 class Known(NamedTuple):
@@ -196,13 +196,7 @@ class Pairing:
     """
 
     def __init__(self, aids: AidsConfig, knowledge: RobotKnowledge, latency: float) -> None:
-        """Take settings, sizes and period.
-
-        Args:
-            aids: the settings.
-            knowledge: of the robot.
-            latency: s, of a given delay.
-        """
+        """Take settings, sizes and period, and the latency [s] of a given delay."""
         spec = knowledge.spec
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
@@ -291,12 +285,7 @@ class Pairing:
         return state._replace(anchor=anchor), paired
 
     def _learned(
-        self,
-        state: PairState,
-        motion: tuple[FloatArray, FloatArray, BoolArray],
-        begin: FloatArray,
-        end: FloatArray,
-        back: BoolArray,
+        self, state: PairState, motion: FeatureMotion, begin: FloatArray, end: FloatArray, back: BoolArray
     ) -> tuple[PairState, Paired]:
         """Return `learn` from a motion that is believed, with the past at both of its ends, (..., D, n + m)."""
         n, (feature_step, duration, valid) = self._n, motion

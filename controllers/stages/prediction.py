@@ -41,7 +41,6 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.estimation import Estimation, EstimationState
-from servobench.controllers.stages.pairing import Past
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, transposed
 from servobench.plant.contract.signals import Observation
@@ -189,13 +188,7 @@ class Predictor:
     """
 
     def __init__(self, aids: AidsConfig, period: float, delays: Delays) -> None:
-        """Take the settings.
-
-        Args:
-            aids: the settings.
-            period: s.
-            delays: of a given response.
-        """
+        """Take the settings, the period [s], and the delays of a given response."""
         self._aids, self._period, self._delays = aids, period, delays
         self.window = max(1, whole_periods(WINDOW, period))
         self._share: float | None = None
@@ -243,27 +236,16 @@ class Predictor:
             bound, lead = q + response.flight(), response.lead
         z = observation.feature
         if self._aids.filter:
-            z = self._filtered(state, stages, estimation, past, observation)
+            moved = stages.motion(estimation, past.exposed - past.before, past.before, past.predicted[0])
+            expected, noise = state.feature + moved, past.noise
+            learned = np.equal(estimation.last.time, observation.time)
+            if self._share is not None:
+                noise, learned = self._share * (z - expected), np.full_like(learned, fill_value=True)
+            z = np.where(learned[..., None] & observation.valid, z - noise, expected)
         J, nominal = stages.ahead(estimation, bound)
         flight = 0.5 * np.matvec(estimation.learned.pair.base + nominal, bound - q)
         feature = z + stages.motion(estimation, past.exposed, bound - past.exposed, past.predicted[1] + flight)
         return PredictorState(response, z), observation.with_values(bound, feature), lead, J
-
-    def _filtered(
-        self,
-        state: PredictorState,
-        stages: Estimation,
-        estimation: EstimationState,
-        past: Past,
-        observation: Observation,
-    ) -> FloatArray:
-        """Return z, (..., m), at the exposure."""
-        moved = stages.motion(estimation, past.exposed - past.before, past.before, past.predicted[0])
-        expected, y, noise = state.feature + moved, observation.feature, past.noise
-        learned = np.equal(estimation.last.time, observation.time)
-        if self._share is not None:
-            noise, learned = self._share * (y - expected), np.full_like(learned, fill_value=True)
-        return np.where(learned[..., None] & observation.valid, y - noise, expected)
 
     def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
         """Return the state after the joint step (..., n), rad, left the chain."""

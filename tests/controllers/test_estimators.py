@@ -121,9 +121,9 @@ def test_the_unscented_filter_equals_the_kalman_filter_over_1000_random_steps(al
     Q, r = 1e-6 * (A @ A.T), np.float64(4e-6)
     J = rng.normal(scale=0.4, size=(m, n))
     P = 1e-3 * (B @ B.T)
-    J_kalman, P_kalman = J, P
+    J_kalman, P_kalman, config = J, P, UkfConfig(alpha=alpha, beta=beta, kappa=kappa)
     for dq, dy in random_motions(n, m, 1000):
-        J, P = unscented_update(J, P + Q, dq, dy, r=r, spread=(alpha, beta, kappa))
+        J, P = unscented_update(J, P + Q, dq, dy, r=r, config=config)
         J_kalman, P_kalman = kalman_update(J_kalman, P_kalman + Q, dq, dy, r=r)
         np.testing.assert_allclose(J, J_kalman, atol=1e-9)
         np.testing.assert_allclose(P, P_kalman, atol=1e-9)
