@@ -187,6 +187,8 @@ _OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforwa
 _GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
 _PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
 
+_both = partial(Method, aids=EQUIPPED, printed={})  # methods best equipped, and as published with the law's defaults
+
 _ROWS = (
     Method(
         "rbfnn_mfac", "rbfnn", "rbf",
@@ -199,35 +201,23 @@ _ROWS = (
         "a regression on the nominal Jacobian, with model-free adaptive control",
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
-    Method(
-        "ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)",
-        {}, EQUIPPED, printed={},
-    ),
+    _both("ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)"),
     Method(
         "ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)",
         {}, _OF_MPC, printed=_PRINTED_MPC,
     ),
-    Method(
+    _both(
         "rbf_pid", "pid", "rbf_lyapunov",
         "Jacobian network under a Lyapunov update with the pseudo-inverse law (eqs. 40-43)",
-        {}, EQUIPPED, printed={},
     ),
     Method("constant", "pid", "constant", "pseudo-inverse of the first Jacobian for ever: the lower bound"),
     Method(
         "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian with the true delays: a bound of its law",
         {}, _GIVEN,
     ),
-    Method(
-        "broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law", {}, EQUIPPED, printed={}
-    ),
-    Method(
-        "rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law",
-        {}, EQUIPPED, printed={},
-    ),
-    Method(
-        "cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin",
-        {}, EQUIPPED, printed={},
-    ),
+    _both("broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law"),
+    _both("rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law"),
+    _both("cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin"),
 )  # fmt: skip
 METHODS: Mapping[str, ControllerEntry] = {method.name: method.entry() for row in _ROWS for method in row.divisions()}
 

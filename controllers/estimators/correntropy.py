@@ -216,13 +216,7 @@ class RmckfConfig(RandomWalk):
 
 
 def rmckf_update(
-    J: FloatArray,
-    P: FloatArray,
-    joint_step: FloatArray,
-    feature_step: FloatArray,
-    *,
-    r: FloatArray,
-    config: RmckfConfig,
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, r: FloatArray, config: RmckfConfig
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, with a P of each row; see `kalman.split_update`."""
     innovation = feature_step - np.matvec(J, joint_step)

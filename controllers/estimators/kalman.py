@@ -29,7 +29,6 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Literal, NamedTuple, TypeAlias, final
 
@@ -164,8 +163,7 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
     def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance."""
         *lead, m, n = jacobian.shape
-        shapes: dict[Covariance, tuple[int, ...]] = {"shared": (n, n), "by_rows": (m, n, n), "full": (m * n, m * n)}
-        shape = shapes[self._covariance]
+        shape = {"shared": (n, n), "by_rows": (m, n, n), "full": (m * n, m * n)}[self._covariance]
         P = np.broadcast_to(np.eye(shape[-1]) * self._config.initial_deviation**2, (*lead, *shape))
         return WalkState(jacobian, P, np.full(lead, False))
 
@@ -210,8 +208,7 @@ class UkfConfig(RandomWalk):
     """Two computations of the same numbers; "sigma_points" is the reference, several times slower."""
 
 
-@dataclass(frozen=True, eq=False)
-class SigmaWeights:
+class SigmaWeights(NamedTuple):
     """Weights of the scaled sigma points."""
 
     reach: float  # √(s + Λ), how many deviations the points stand off

@@ -47,6 +47,16 @@ def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, ker
     return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
 
 
+def _layer(x: FloatArray, kernel: Kernel, centres: FloatArray, ones: FloatArray, decay: FloatArray) -> FloatArray:
+    """Return a hidden layer, (..., L), at x, (..., p), for centres (p, L), ones (p,) and the negative decay (L,)."""
+    offset = x[..., :, None] - centres
+    offset *= offset
+    square: FloatArray = np.vecmat(ones, offset)
+    exponent = (square if kernel == "gaussian" else np.sqrt(square, out=square)) * decay
+    np.maximum(exponent, MIN_EXPONENT, out=exponent)
+    return np.exp(exponent, out=exponent)
+
+
 def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> FloatArray:
     """Return q_cmd = ψ ξ with ψ_j = W_j h (eqs. 12, 17).
 
@@ -126,12 +136,7 @@ class JacobianNetwork:
 
     def features(self, q: FloatArray) -> FloatArray:
         """Return the U different layers θ of all columns, (..., U, L), at q, (..., n), rad."""
-        centres, ones, decay = self._prepared
-        offset = q[..., None, :, None] - centres
-        offset *= offset
-        theta: FloatArray = np.vecmat(ones, offset) * decay
-        np.maximum(theta, MIN_EXPONENT, out=theta)
-        return np.exp(theta, out=theta)
+        return _layer(q[..., None, :], "gaussian", *self._prepared)
 
     def output(self, rows: FloatArray, theta: FloatArray) -> FloatArray:
         """Return Ĵ_i = W_i θ_i (eqs. 30, 41) at T joint positions, (..., T, m, n), m/rad.
@@ -141,10 +146,9 @@ class JacobianNetwork:
             theta: from `features`, (..., T, U, L).
         """
         lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
+        # the products of each layer with each column, of which most are not wanted
         every = theta.reshape(*lead, count * layers, units) @ transposed(rows.reshape(*rows.shape[:-3], -1, units))
-        return every.reshape(*lead, count, -1).take(
-            self._places, axis=-1
-        )  # of the products of each layer with each column
+        return every.reshape(*lead, count, -1).take(self._places, axis=-1)
 
     def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
         """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖² (eqs. 31, 32).
@@ -226,15 +230,7 @@ class ControllerNetwork:
 
     def features(self, xi: FloatArray) -> FloatArray:
         """Return h, (..., N_h), at ξ (..., p), as `hidden_features` does, in less time; last bits may differ."""
-        centres, ones, decay = self._prepared
-        offset = xi[..., :, None] - centres
-        offset *= offset
-        h: FloatArray = np.vecmat(ones, offset)
-        if self.kernel == "exponential":
-            np.sqrt(h, out=h)
-        h *= decay
-        np.maximum(h, MIN_EXPONENT, out=h)
-        return np.exp(h, out=h)
+        return _layer(xi, self.kernel, *self._prepared)
 
     def command(self, xi: FloatArray) -> FloatArray:
         """Return q_cmd = ψ(ξ) ξ, (..., n), rad, with the weights as they were trained."""

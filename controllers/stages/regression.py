@@ -284,13 +284,7 @@ class Regression:
         return derivative
 
     def _streak(self, state: RegressionState, found: Innovation, last: FloatArray) -> IntArray:
-        """Return the number of successive frames that do not fit, each of which agrees with the one before.
-
-        Args:
-            state: before the motion.
-            found: by the filter with the largest weight.
-            last: e of the last frame, by that filter.
-        """
+        """Return `streak` after a motion `found` by the filter with the largest weight; `last` is its e before."""
         fits = found.square <= GATE * found.variance
         alone = found.nu - last  # ν without the noise of the last frame
         agrees = (np.vecdot(alone, alone) < AGREEMENT * found.square) | (state.streak == 0)
