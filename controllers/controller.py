@@ -80,11 +80,9 @@ class RobotKnowledge:
                 raise ValueError(f"observation.{name} must have shape {(size,)}, got {shape}")
         if reference is None:
             return
-        wanted = (1 + self.preview, self.spec.m)
-        if np.shape(reference) != wanted:
-            raise ValueError(
-                f"reference must have shape {wanted} for a preview of {self.preview}, got {np.shape(reference)}"
-            )
+        wanted, shape = (1 + self.preview, self.spec.m), np.shape(reference)
+        if shape != wanted:
+            raise ValueError(f"reference must have shape {wanted} for a preview of {self.preview}, got {shape}")
         if not is_finite(reference):
             raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")
 

@@ -210,12 +210,7 @@ class NmpcCalibrated(Controller):
         return np.asarray(feature)[:, 0], np.asarray(jacobian)
 
     def _improve(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Return the plan after the Gauss-Newton steps, (H, n) rad; rest, if there is no solution.
-
-        Args:
-            start: joint position at which the plan begins, (n,), rad.
-            wanted: features that the model should show along the plan, (H, m), m.
-        """
+        """Return a plan, (H, n) rad, from `start`, (n,) rad, to features `wanted`, (H, m); rest without a solution."""
         last = self._last, self._change * self._spec.period
         bounds = joint_bounds(self._shape, self._spec, last, start, np.zeros(0))
         plan, change, iterations = self._plan, math.inf, 0

@@ -143,9 +143,7 @@ class Servo:
         if self.predictor is not None:
             predictor, ahead, lead, J = self.predictor.predict(predictor, self.estimation, estimation, observation)
             later = shifted(reference, lead, self._rows)
-        forward: FloatArray = np.zeros(())
-        if self._feeds_forward:
-            forward = later[..., 1, :] - later[..., 0, :]
+        forward = later[..., 1, :] - later[..., 0, :] if self._feeds_forward else np.zeros(())
         law, wanted = self._command(state, estimation, J, ahead, later)
         if not is_finite(wanted):
             raise ControllerDiverged(

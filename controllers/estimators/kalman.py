@@ -285,11 +285,9 @@ class RlsConfig:
 
     def __post_init__(self) -> None:
         """Check across fields."""
-        if self.covariance_limit < self.initial_covariance:
-            raise ValueError(
-                f"covariance_limit must be at least initial_covariance = {self.initial_covariance:g}, "
-                f"got {self.covariance_limit:g}"
-            )
+        limit, least = self.covariance_limit, self.initial_covariance
+        if limit < least:
+            raise ValueError(f"covariance_limit must be at least initial_covariance = {least:g}, got {limit:g}")
 
 
 def rls_update(

@@ -13,7 +13,6 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import FeatureMemo
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
@@ -78,7 +77,11 @@ NetworkState = TypeVar("NetworkState", RbfState, RbfLyapunovState)
 
 
 class NetworkEstimator(Estimator[NetworkState]):
-    """A Jacobian network whose weights are updated online."""
+    """A Jacobian network whose weights are updated online.
+
+    It keeps θ and Ĵ of the last joint positions and the change of the last weights, which are asked for more than once.
+    That saves time only: they are values of pure functions, and rows of weights never change.
+    """
 
     brings_model = True
 
@@ -86,20 +89,39 @@ class NetworkEstimator(Estimator[NetworkState]):
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
-        self._features = FeatureMemo(self._network)
+        self._position, self._shape = b"", (-1,)
+        self._theta, self._rows, self._jacobian, self._changed, self._change = (np.empty(0),) * 5
 
     def _started(self, jacobian: FloatArray) -> FloatArray:
         """Return the offline weights, (..., m, n, L); Ĵ₀, which holds for one joint position alone, is left out."""
         rows: FloatArray = self._network.rows
         return np.broadcast_to(rows, (*jacobian.shape[:-2], *rows.shape))
 
-    def deviation(self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray) -> FloatArray:
-        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
-        return self._features.deviation(state.rows, None if first is None else first.rows, joint_position)
+    def features(self, q: FloatArray) -> FloatArray:
+        """Return θ, (..., U, L), at q, (..., n), rad."""
+        position = q.tobytes()
+        if position != self._position or q.shape != self._shape:
+            self._theta = self._network.features(q)
+            self._position, self._shape, self._rows = position, q.shape, np.empty(0)
+        return self._theta
 
     def jacobian(self, state: NetworkState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
-        return self._features.jacobian(state.rows, joint_position)
+        return self._with_rows(state.rows, joint_position)
+
+    def deviation(self, state: NetworkState, first: NetworkState | None, joint_position: FloatArray) -> FloatArray:
+        """Return the Jacobian of the difference of the weights; see `Estimator.deviation`."""
+        if first is None:
+            return self.jacobian(state, joint_position)
+        if state.rows is not self._changed:
+            self._changed, self._change = state.rows, state.rows - first.rows
+        return self._with_rows(self._change, joint_position)
+
+    def _with_rows(self, rows: FloatArray, q: FloatArray) -> FloatArray:
+        theta = self.features(q)
+        if rows is not self._rows:
+            self._jacobian, self._rows = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :], rows
+        return self._jacobian
 
 
 @final
@@ -143,7 +165,7 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         if motion.noise is not None:
             ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
-        theta = self._features.at(motion.joint_position)[..., None, :, :]
+        theta = self.features(motion.joint_position)[..., None, :, :]
         joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
         if config.window > 1:
             theta = np.concatenate([state.theta, theta], axis=-3)
@@ -206,8 +228,8 @@ class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
 
     def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:
         """Learn from one motion."""
-        q, dq, theta = motion.joint_position, motion.joint_step[..., None, :], self._features.at(motion.joint_position)
-        unexplained = motion.feature_step - np.matvec(self._features.jacobian(state.rows, q), motion.joint_step)
+        q, dq, theta = motion.joint_position, motion.joint_step[..., None, :], self.features(motion.joint_position)
+        unexplained = motion.feature_step - np.matvec(self.jacobian(state, q), motion.joint_step)
         s = unexplained / np.asarray(motion.duration)[..., None]
         pull = self._config.n3 * s - self._config.n2 * motion.error
         rows = self._network.gradient(pull[..., None, :], dq, theta[..., None, :, :])

@@ -206,14 +206,16 @@ class RbfnnLaw(Law[RbfnnState]):
         self._preview_places = rate * np.arange(config.horizon + 1.0)
         self._error_places = rate * np.arange(float(network.error_history))
         self._position_places = rate * np.arange(float(network.position_history))
+        self._rows = [1 + math.ceil(float(places[-1])) for places in (self._error_places, self._position_places)]
 
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
         network, lead, q = self._network, observation.feature.shape[:-1], observation.joint_position
+        errors, positions = self._rows
         return RbfnnState(
             learned=np.zeros((*lead, *network.weights.shape)),
-            errors=np.full((*lead, _rows(self._error_places), network.m), np.nan),
-            positions=np.repeat(q[..., None, :], _rows(self._position_places), axis=-2),
+            errors=np.full((*lead, errors, network.m), np.nan),
+            positions=np.repeat(q[..., None, :], positions, axis=-2),
             predicted=np.zeros((*lead, self._config.horizon, network.m)),
             step_size=np.zeros(lead),
         )
@@ -296,11 +298,6 @@ def update_share(k: float, period: float, step: float) -> float:
     """
     steps = in_periods(period, step)
     return min(-math.expm1(steps * math.log1p(-k)) if k < 1.0 else k * steps, k)
-
-
-def _rows(places: FloatArray) -> int:
-    """Return the number of rows of a history that is sampled at these places."""
-    return 1 + math.ceil(float(places[-1]))
 
 
 def _filled_by_first(errors: FloatArray) -> FloatArray:

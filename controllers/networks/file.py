@@ -36,11 +36,9 @@ class TrainedNetworks:
 
     def __post_init__(self) -> None:
         """Check that both networks are of the same robot."""
-        if (self.jacobian.n, self.jacobian.m) != (self.controller.n, self.controller.m):
-            raise ValueError(
-                f"both networks must have the same sizes (n, m), got {(self.jacobian.n, self.jacobian.m)} and "
-                f"{(self.controller.n, self.controller.m)}"
-            )
+        one, other = ((network.n, network.m) for network in (self.jacobian, self.controller))
+        if one != other:
+            raise ValueError(f"both networks must have the same sizes (n, m), got {one} and {other}")
 
 
 def save_networks(networks: TrainedNetworks, path: Path) -> None:

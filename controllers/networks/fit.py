@@ -90,11 +90,7 @@ class ControllerSamples:
     position: FloatArray  # q(k−1), (S, n), rad
     gain: FloatArray  # K_p s J⁺ at q(k−1), (S, n, m), rad/m; little where joints hardly move the feature
     posture_step: FloatArray  # K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y
-
-    @property
-    def command(self) -> FloatArray:
-        """Joint position that the ideal controller commands, (S, n), rad."""
-        return np.asarray(self.position + (self.gain @ self.error[..., None])[..., 0] + self.posture_step)
+    command: FloatArray  # joint position that the ideal controller commands, (S, n), rad
 
 
 def controller_dimension(config: TrainingConfig, spec: PlantSpec) -> int:
@@ -133,8 +129,9 @@ def controller_samples(
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
-    proportional, posture = plan.gain * plan.step, posture_gain * plan.step
-    return ControllerSamples(rbf.information_vector(errors, positions), error, q, proportional * pinv, posture * free)
+    gain, posture_step = plan.gain * plan.step * pinv, posture_gain * plan.step * free
+    command = q + (gain @ error[..., None])[..., 0] + posture_step
+    return ControllerSamples(rbf.information_vector(errors, positions), error, q, gain, posture_step, command)
 
 
 def train(
@@ -174,10 +171,10 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
     """
     if not config.lower:
         if knowledge.region is None:
-            needed = (
-                "lower and upper, one number a joint, rad, and a nominal model, such as nominal in an FMU's mapping"
+            raise ValueError(
+                "training needs a region and a model of the robot: give lower and upper, one number a joint, rad, and "
+                "a nominal model, such as nominal in an FMU's mapping"
             )
-            raise ValueError(f"training needs a region and a model of the robot: give {needed}")
         lower, upper = knowledge.region
         config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
     spec = knowledge.spec
@@ -189,11 +186,9 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
         raise ValueError(
             "training needs a nominal model, and this plant has none; an FMU gets one by nominal in its mapping"
         )
-    if (networks.jacobian.n, networks.jacobian.m) != (spec.n, spec.m):
-        raise ValueError(
-            f"network must be of {spec.n} joints and {spec.m} features, "
-            f"got {networks.jacobian.n} and {networks.jacobian.m}"
-        )
+    n, m = networks.jacobian.n, networks.jacobian.m
+    if (n, m) != (spec.n, spec.m):
+        raise ValueError(f"network must be of {spec.n} joints and {spec.m} features, got {n} and {m}")
     return networks
 
 

@@ -14,7 +14,7 @@ the paper: exponents are cut at 60, so that a unit far away is 1e-26 instead of 
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, final, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -261,41 +261,3 @@ def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, .
         object.__setattr__(network, name, array)
     if not (network.widths > 0.0).all():
         raise ValueError(f"widths must be positive, the smallest is {network.widths.min()}")
-
-
-@final
-class FeatureMemo:
-    """Keeps what an estimator needs twice: θ and Ĵ of the last joint positions, and the change of the last weights.
-
-    It saves time only: it is a memo of pure functions, and rows of weights never change.
-    """
-
-    def __init__(self, network: JacobianNetwork) -> None:
-        """Take the network, with an empty memo."""
-        self._network = network
-        self._position, self._shape = b"", (-1,)
-        self._theta, self._rows, self._jacobian, self._changed, self._change = (np.empty(0),) * 5
-
-    def at(self, q: FloatArray) -> FloatArray:
-        """Return θ, (..., U, L), at q, (..., n), rad."""
-        position = q.tobytes()
-        if position != self._position or q.shape != self._shape:
-            self._theta = self._network.features(q)
-            self._position, self._shape, self._rows = position, q.shape, np.empty(0)
-        return self._theta
-
-    def jacobian(self, rows: FloatArray, q: FloatArray) -> FloatArray:
-        """Return Ĵ, (..., m, n), m/rad, at q, (..., n), rad, with weights by rows, (..., m, n, L)."""
-        theta = self.at(q)
-        if rows is not self._rows:
-            self._jacobian = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :]
-            self._rows = rows
-        return self._jacobian
-
-    def deviation(self, rows: FloatArray, first: FloatArray | None, q: FloatArray) -> FloatArray:
-        """Return Ĵ, (..., m, n), m/rad, at q with the change of the weights since `first`; as they are if None."""
-        if first is None:
-            return self.jacobian(rows, q)
-        if rows is not self._changed:
-            self._changed, self._change = rows, rows - first
-        return self.jacobian(self._change, q)

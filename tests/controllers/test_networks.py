@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from kit.toy import jacobian_features, jacobian_network
-from servobench.controllers.networks.rbf import (
-    ControllerNetwork,
-    FeatureMemo,
-    JacobianNetwork,
-    hidden_features,
-    information_vector,
-)
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features, information_vector
 
 
 def controller_network(n=3, m=2, hidden=5, error_history=2, position_history=1, kernel="exponential", seed=0):
@@ -70,20 +64,6 @@ def test_the_quick_features_of_the_controller_network_are_those_of_the_plain_for
         plain = hidden_features(xi, network.centres, network.widths, kernel)
         np.testing.assert_allclose(network.features(xi), plain, rtol=1e-12)
     np.testing.assert_array_equal(network.features(network.centres[3])[3], 1.0)
-
-
-def test_the_memo_returns_the_features_of_the_given_position():
-    network, (first, second) = jacobian_network(), np.random.default_rng(5).normal(size=(2, 3))
-    memo = FeatureMemo(network)
-    for q in (first, first, second, first):
-        np.testing.assert_array_equal(memo.at(q), network.features(q))
-    q = first.copy()
-    memo.at(q)
-    q[0] += 1.0
-    np.testing.assert_array_equal(memo.at(q), network.features(q))
-    for rows in (network.rows, 2.0 * network.rows):
-        for q in (first, first, second, np.stack([first, second])):
-            np.testing.assert_array_equal(memo.jacobian(rows, q), network.jacobian(q, rows))
 
 
 @pytest.mark.parametrize(("kernel", "power"), [("exponential", 1), ("gaussian", 2)])

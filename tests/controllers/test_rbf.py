@@ -138,6 +138,21 @@ def test_what_was_learned_fades_by_its_leak_per_second():
     assert np.abs(learned).max() > 1e-4
 
 
+def test_a_kept_value_is_returned_only_for_the_same_position_and_weights():
+    net, (first, second) = network(), np.random.default_rng(5).normal(size=(2, 3))
+    run = started(RbfConfig(), net)
+    for q in (first, first, second, first):
+        np.testing.assert_array_equal(run.estimator.features(q), net.features(q))
+    q = first.copy()
+    run.estimator.features(q)
+    q[0] += 1.0
+    np.testing.assert_array_equal(run.estimator.features(q), net.features(q))
+    for rows in (net.rows, 2.0 * net.rows):
+        state = run.state._replace(rows=rows)
+        for q in (first, first, second, np.stack([first, second])):
+            np.testing.assert_array_equal(run.estimator.jacobian(state, q), net.jacobian(q, rows))
+
+
 def started_lyapunov(config, net):
     return Learning(RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n)))
 
