@@ -92,7 +92,6 @@ LAWS: dict[str, Part[Law[Any]]] = {
     "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
 }
 
-
 PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
 
 

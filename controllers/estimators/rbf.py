@@ -165,12 +165,9 @@ class RbfEstimator(NetworkEstimator[RbfState]):
         if motion.noise is not None:
             ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
-        theta = self.features(motion.joint_position)[..., None, :, :]
-        joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
-        if config.window > 1:
-            theta = np.concatenate([state.theta, theta], axis=-3)
-            joint_steps = np.concatenate([state.joint_steps, joint_steps], axis=-2)
-            feature_steps = np.concatenate([state.feature_steps, feature_steps], axis=-2)
+        theta = np.concatenate([state.theta, self.features(motion.joint_position)[..., None, :, :]], axis=-3)
+        joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
+        feature_steps = np.concatenate([state.feature_steps, motion.feature_step[..., None, :]], axis=-2)
         errors = feature_steps - np.matvec(network.output(state.rows, theta), joint_steps)
         filled = np.minimum(state.filled + 1, config.window)
         sizes = np.vecdot(theta, theta).take(network.layer_of, axis=-1)

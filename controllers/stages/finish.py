@@ -63,7 +63,7 @@ def redistribute(
     jacobian: FloatArray,
     limit: FloatArray,
     damping: float,
-    further: tuple[FloatArray, FloatArray] | None = None,
+    further: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
     """Return a joint step within the limits that moves the feature by f Ĵ dq, 0 < f ≤ 1, with a large f.
 
@@ -73,14 +73,11 @@ def redistribute(
         limit: (n,), rad, positive.
         damping: m/rad, positive; the remaining joints make little motion in directions in which they are weaker, and
             the feature's direction is kept except for the part that they leave out.
-        further: how far a joint that takes over may go down and up in total, two arrays (..., n), rad, at least 0;
-            None: as far as its limit.
+        further: how far a joint that takes over may go down and up in total, two arrays (..., n), rad, at least 0.
 
     Returns:
         (..., n), rad; `joint_step` itself where it keeps the limits.
     """
-    if further is None:
-        further = np.broadcast_to(limit, joint_step.shape), np.broadcast_to(limit, joint_step.shape)
     take_over = partial(_take_over, limit=limit, damping=damping)
 
     def shared(joint_step: FloatArray, jacobian: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:

@@ -176,7 +176,6 @@ class Paired(NamedTuple):
 class Past(NamedTuple):
     """The past motion that the predict stage needs."""
 
-    delay: FloatArray  # d, (...), periods.
     exposed: FloatArray  # q(k−d), (..., n), rad.
     before: FloatArray  # q(k−d) − q(k−d−1), (..., n), rad.
     # J_n Δq, (..., m), along each of them: from q(k−d−1) to q(k−d), and from there to q(k).
@@ -248,8 +247,7 @@ class Pairing:
         exposed, before = rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
         since = state.past[..., 0, :] - exposed
         moved, noise = joint_position - state.past[..., window, :n], state.regression.mean[..., -1]
-        x = before[..., n:], since[..., n:]
-        return Past(self.delay(state), exposed[..., :n], before[..., :n], x, moved, noise)
+        return Past(exposed[..., :n], before[..., :n], (before[..., n:], since[..., n:]), moved, noise)
 
     def noise(self, state: PairState) -> FloatArray | None:
         """Return σ, (...), m; None where it is not identified."""

@@ -50,6 +50,7 @@ PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some 
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
 PREDICTION_TOLERANCE = 0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
+SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that does not overshoot
 
 
@@ -140,13 +141,12 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
 
 def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     """Return the state with another response g, (..., N), and with the quantities derived from it."""
-    length = response.shape[-1]
     ahead = response[..., ::-1].cumsum(axis=-1)[..., ::-1]  # g_i + … + g_N
     left = np.zeros_like(ahead)
     left[..., :-1] = ahead[..., 1:]
     total = ahead[..., 0]
     lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
-    return state._replace(response=response, left=left, lead=np.minimum(lead, length) * (total > 0.5))
+    return state._replace(response=response, left=left, lead=np.minimum(lead, response.shape[-1]) * (total > 0.5))
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:
@@ -167,9 +167,6 @@ def remaining_share(delay: float, lag: float, period: float, length: int) -> Flo
 def pushed(history: FloatArray, newest: FloatArray) -> FloatArray:
     """Return the history (..., length, k) with the newest value (..., k) first."""
     return np.concatenate([newest[..., None, :], history[..., :-1, :]], axis=-2)
-
-
-SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 
 
 class PredictorState(NamedTuple):
@@ -230,7 +227,7 @@ class Predictor:
         if pairing is None:
             raise ValueError("aids: a stage that predicts needs the pair stage")
         past = pairing.past(estimation.learned.pair, q, self.window)
-        response, bound, lead = state.response, q, np.zeros_like(past.delay)
+        response, bound, lead = state.response, q, np.zeros(q.shape[:-1])[()]
         if self._aids.response != "ignored":
             response = response.learn(past.window) if self._aids.response == "identified" else response
             bound, lead = q + response.flight(), response.lead

@@ -84,10 +84,10 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
 
 def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
     """Both move the feature by 1 m/rad; (0.3, 0.1) wants 0.4 m, scaled to (0.1, 0.033); the second goes on to 0.1."""
-    dq = redistribute(np.array([0.3, 0.1]), np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9)
+    J, limit, small = np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), np.array([0.05, 0.1])
+    dq = redistribute(np.array([0.3, 0.1]), J, limit, 1e-9, (limit, limit))
     np.testing.assert_allclose(dq, [0.1, 0.1])
-    small = np.array([0.05, 0.1])
-    np.testing.assert_array_equal(redistribute(small, np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9), small)
+    np.testing.assert_array_equal(redistribute(small, J, limit, 1e-9, (limit, limit)), small)
 
 
 @settings(max_examples=60)
@@ -96,7 +96,7 @@ def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, se
     rng = np.random.default_rng(seed)
     J, limit = rng.normal(size=(m, n)), rng.uniform(0.05, 0.2, n)
     wanted = rng.normal(size=n)
-    dq, scaled = redistribute(wanted, J, limit, 1e-6), scale_to_limit(wanted, limit)
+    dq, scaled = redistribute(wanted, J, limit, 1e-6, (limit, limit)), scale_to_limit(wanted, limit)
     assert (np.abs(dq) <= limit * (1 + 1e-12)).all()
     way = J @ wanted
     if np.linalg.cond(J) < 100.0:

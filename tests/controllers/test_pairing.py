@@ -116,7 +116,7 @@ def test_a_given_delay_is_used_as_it_is(latency):
     made, q = Following(latency=latency, delay="given"), path(1.0)
     made.follow(q, features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
-    _, exposed, before, moved, _, _ = made.stages.pairing.past(made.pair, q[-1], 1)
+    exposed, before, moved, *_ = made.stages.pairing.past(made.pair, q[-1], 1)
     at = len(q) - 1 - latency / PERIOD
     newest = int(np.ceil(round(at, 9)))  # of the three rows of a parabola
     wanted = []

@@ -68,7 +68,7 @@ CASES = {
     "spectrum": lambda a, b: np.linalg.svd(np.concatenate([a, b], axis=-1), full_matrices=False)[1],
     "rotation": lambda a, b: nearest_rotation(a) @ nearest_rotation(b),
     "damped": lambda a, b: damped_inverse(a[:2], 0.02) @ b[:2],
-    "redistribution": lambda a, b: redistribute(3.0 * b[0], a[:2], np.full(3, 0.8), 0.02),
+    "redistribution": lambda a, b: redistribute(3.0 * b[0], a[:2], np.full(3, 0.8), 0.02, (np.full(3, 0.8),) * 2),
     "ways": lambda a, b: lanes.branch(a[0, 0] > 0.0, lambda x, y: x * y, a, b),
     "nested_ways": lambda a, b: lanes.branch(
         a[0, 0] < 9.0, lambda x, y: lanes.branch(y[0, 0] > 0.0, lambda z: -z, x) + y, a, b

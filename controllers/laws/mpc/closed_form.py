@@ -30,6 +30,7 @@ from servobench.plant.contract.lanes import transposed
 _SERIES_BELOW = 0.5  # below, the series of 18 terms is exact to rounding; above, the closed form
 _SERIES_TERMS = 18
 _MIN_POWER = 1e-150  # [1] smaller weights count as 0, so that products with them do not underflow
+REFERENCE_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -188,9 +189,6 @@ class UnlimitedPlan:
         both = self._back @ (along @ (transposed(V) @ weighted))
         moves = len(self._forth)
         return both[..., :moves, :], both[..., moves:, :]
-
-
-REFERENCE_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
 
 
 @dataclass(frozen=True)
