@@ -100,7 +100,8 @@ class Servo:
             ControllerDiverged: the estimate, or the command of the law, is not finite in at least one lane.
             RunFault: a part cannot go on in at least one lane.
         """
-        observation, reference = self._natural(observation), reference / self._unit
+        if self._unit != 1.0:
+            observation, reference = self._natural(observation), reference / self._unit
         if self.initial.immediate:
             return self._act((state, observation.joint_position), observation, reference)
         both = state, np.zeros_like(observation.joint_position)

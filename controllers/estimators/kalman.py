@@ -169,9 +169,10 @@ class RandomWalkEstimator(GatedEstimator[WalkState]):
 
     def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         noise: FloatArray = self._noise if motion.noise is None else motion.noise
-        walk = self._walk * np.asarray(motion.duration)
-        P = plus_diagonal(state.P, np.expand_dims(walk, tuple(range(walk.ndim, state.P.ndim - 1))))
-        r = np.broadcast_to(2.0 * noise * noise, walk.shape)[()]
+        walk, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
+        if r.ndim < walk.ndim:
+            r = np.broadcast_to(r, walk.shape)
+        P = plus_diagonal(state.P, walk[..., None, None] if self._covariance == "by_rows" else walk[..., None])
         J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
         cholesky_of(P)
         return state._replace(J=J, P=P)
