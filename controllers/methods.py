@@ -255,11 +255,11 @@ class OwnLaw(Law[None]):
 
     def __init__(self, make: Callable[[RobotKnowledge], Controller], given: RobotKnowledge, aids: AidsConfig) -> None:
         """Make the controller with its knowledge of a robot, in the unit of the plant."""
-        self._nominal, self._unit, self.seed = given.nominal_jacobian, given.spec.feature.scale, 0
+        self._nominal = None if aids.model == "own" else given.nominal_jacobian  # which is corrected
+        self._unit, self.seed = given.spec.feature.scale, 0
         self._correction: FloatArray | float = 0.0
         self._rows = 1 if aids.feedforward else 1 + given.preview
-        self._corrects = self._nominal is not None and aids.model != "own"
-        model = self._jacobian if self._corrects else self._nominal
+        model = given.nominal_jacobian if self._nominal is None else self._jacobian
         self.own = make(replace(given, nominal_jacobian=model, preview=self._rows - 1))
         self.owns = frozenset() if aids.feedforward else frozenset({"preview"})
         self.in_model_frame = self.own.in_model_frame
@@ -273,7 +273,7 @@ class OwnLaw(Law[None]):
         self, state: None, estimate: Estimate, observation: Observation, reference: FloatArray
     ) -> tuple[None, FloatArray]:
         """Return the joint velocity of the controller, (n,) rad/s."""
-        if self._nominal is not None and self._corrects:
+        if self._nominal is not None:
             self._correction = self._unit * estimate.jacobian - self._nominal(observation.joint_position)
         wanted = self._unit * reference[: self._rows]
         return state, self.own.step(self._in_plant_unit(observation), wanted).joint_velocity

@@ -6,8 +6,7 @@ With Ĵ and the weights frozen, for t = 1 … T, in steps of the length for whic
     G_j = Σ_t [Ĵᵀ e(k+t)] ξ_j(k+t−1) h(k+t−1)ᵀ,   α = k Σ_t ‖e(k+t)‖² / (ε + ‖G‖²_F),   W_j ← W_j + α G_j
 
 −G is the gradient of I_c = ½ Σ ‖e(k+t)‖² with the paper's truncation (eq. 18): each term is differentiated through its
-own step only. Departures from the paper: ε, the joint-speed limit inside the prediction, and α > 0 where the
-paper writes a negative α into an update with the opposite sign.
+own step only.
 """
 
 import math
@@ -172,7 +171,8 @@ class RbfnnLaw(Law[RbfnnState]):
     s step [s].
 
     Departures from the paper:
-    - ε, and the joint-speed limit in prediction and command.
+    - ε, the joint-speed limit in prediction and command, and α > 0 where the paper writes a negative α into an update
+      with the opposite sign.
     - "q(k−1)" is by default the measured position at instant k, from which the next step starts: the sum of all
       commands drifts away from the arm where a joint saturates or does not reach its commanded speed.
     - A network fitted offline does not rest where e = 0: far outside of its region it asks for more than 1 rad/s there,
@@ -226,7 +226,8 @@ class RbfnnLaw(Law[RbfnnState]):
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
         config, jacobian, learned = self._config, estimate.jacobian, state.learned
         errors = pushed(state.errors, reference[..., 0, :] - observation.feature)
-        errors = branch(np.isnan(errors[..., -1, 0]), _filled_by_first, errors)
+        begins = np.isnan(errors[..., -1, 0])  # the first error fills its history
+        errors = branch(begins, lambda first: np.repeat(first[..., :1, :], self._rows[0], axis=-2), errors)
         positions = state.positions
         if config.position == "measured":
             positions = pushed(positions, observation.joint_position)
@@ -298,8 +299,3 @@ def update_share(k: float, period: float, step: float) -> float:
     """
     steps = in_periods(period, step)
     return min(-math.expm1(steps * math.log1p(-k)) if k < 1.0 else k * steps, k)
-
-
-def _filled_by_first(errors: FloatArray) -> FloatArray:
-    """Return errors (..., rows, m) in which each is the first one."""
-    return np.repeat(errors[..., :1, :], errors.shape[-2], axis=-2)
