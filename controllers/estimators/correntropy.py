@@ -109,7 +109,7 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `kalman.split_update`, as for the others up to `r`.
+        J: J⁻; see `kalman.kalman_update`, as for the others up to `r`.
         P: covariance of each row after the walk, (..., m, n, n).
         joint_step: Δq.
         feature_step: Δy.
@@ -186,7 +186,7 @@ class ImcckfConfig(RandomWalk):
 def imcckf_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
+    """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
     PH, gain = weighted_gain(P, joint_step, weight, r)
@@ -218,7 +218,7 @@ class RmckfConfig(RandomWalk):
 def rmckf_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, r: FloatArray, config: RmckfConfig
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion, with a P of each row; see `kalman.split_update`."""
+    """Correct by one motion, with a P of each row; see `kalman.kalman_update`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(innovation / np.sqrt(r)[..., None], config.bandwidth) + config.regularisation
     _, gain = weighted_gain(P, joint_step, weight, r)

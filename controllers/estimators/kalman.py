@@ -91,7 +91,7 @@ def joseph(P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray,
 
 
 def symmetric(P: FloatArray) -> FloatArray:
-    """Return (P + Pᵀ)/2, (..., n, n), of which rounding is removed."""
+    """Return (P + Pᵀ)/2, (..., n, n): rounding leaves a covariance a little asymmetric."""
     return np.asarray((P + transposed(P)) / 2)
 
 
@@ -132,7 +132,7 @@ def split_update(
 
 
 Update: TypeAlias = Callable[..., tuple[FloatArray, FloatArray]]
-"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `split_update`; the
+"""The formula by which a filter corrects the Jacobian and its covariance after the walk, called as `kalman_update`; the
 shape of P depends on the filter, see `Covariance`."""
 Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
 """One P, (n, n), that all rows of J share; one of each row, (m, n, n); or one of all entries, (mn, mn)."""
