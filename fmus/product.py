@@ -34,9 +34,6 @@ HEADERS: Final = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
-FMI_SOURCES: Final = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_derivatives.c", "fmi3_absent.c")}
-INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
-SHARED_SOURCES: Final = ("model.c", "instance.c")
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 PLACEHOLDER: Final = "{token}"
 RELATED_FILES: Final = (
@@ -61,14 +58,7 @@ class Product:
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""
         described, version_ = self.description, self.fmi_version
-        machinery = (
-            "model_functions.h",
-            "instance.h",
-            "instance.c",
-            "shared_functions.h",
-            INSTANCE_HEADERS[version_],
-            *FMI_SOURCES[version_],
-        )
+        machinery = ("model_functions.h", "instance.h", "instance.c", "shared_functions.h", f"fmi{version_}.c")
         texts = {name: committed(MACHINERY, name) for name in machinery}
         texts |= {name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")}
         texts |= {name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8") for name in HEADERS[version_]}
@@ -143,13 +133,13 @@ def check_version(fmi_version: int) -> None:
     Raises:
         ValueError: neither 2 nor 3.
     """
-    if fmi_version not in FMI_SOURCES:
+    if fmi_version not in HEADERS:
         raise ValueError(f"fmi_version must be 2 or 3, got {fmi_version}")
 
 
 def c_files(fmi_version: int, core: str) -> tuple[str, ...]:
     """Return the C files to compile, in order."""
-    return (*FMI_SOURCES[fmi_version], *SHARED_SOURCES, f"{core}.c")
+    return (f"fmi{fmi_version}.c", "model.c", "instance.c", f"{core}.c")
 
 
 def committed(folder: str, name: str) -> str:

@@ -12,21 +12,6 @@
 
 static const double start_values[N_VALUES] = START_VALUES;
 
-const char *model_explain(ModelStatus status)
-{
-    switch (status) {
-    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
-    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
-    case MODEL_BAD_VALUE: return "the value is not finite";
-    case MODEL_NO_DERIVATIVES: return "the controller is sampled and has no derivatives";
-    case MODEL_TOO_LONG: return "the step is longer than a million periods";
-    case MODEL_NOT_FINITE: return "the estimate or the command is not finite";
-    case MODEL_NOT_DEFINITE: return "a covariance is not positive definite";
-    case MODEL_NO_MEMORY: return "out of memory";
-    default: return NULL;
-    }
-}
-
 void model_reset(Model *model, int exchange)
 {
     memset(model, 0, sizeof *model);
@@ -38,25 +23,13 @@ void model_start(Model *model) { model->known = 0; }
 
 void model_accept(Model *model) { (void)model; }
 
-ModelStatus model_check(const Model *model)
+const char *model_set(Model *model, size_t index, double value, int starting)
 {
-    return MODEL_OK;
-}
-
-ModelStatus model_admits(size_t index, int starting, int exchanging)
-{
-    return MODEL_OK;
-}
-
-ModelStatus model_set(Model *model, size_t index, double value)
-{
-    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
-    if (index >= N_SETTABLE) return MODEL_NOT_SETTABLE;
-    if (!isfinite(value)) return MODEL_BAD_VALUE;
+    if (!isfinite(value)) return "the value is not finite";
     model->values[index] = value;
     model->touched = 1;
     model->known = 0;
-    return MODEL_OK;
+    return NULL;
 }
 
 static double instant(const Model *model) { return model->begun ? model->first + model->sample * PERIOD : model->time; }
@@ -68,6 +41,15 @@ static int waits(const Model *model)
         if (model->values[OFFSET_SEEN + i] != 0.0) return 0;
     }
     return !model->begun;
+}
+
+/* Where the last sample of a step may be. */
+static double last_instant(const Model *model, double step) { return model->time + step - SAMPLE_SHARE * PERIOD; }
+
+const char *model_check(const Model *model, double step)
+{
+    const int endless = !waits(model) && last_instant(model, step) - instant(model) > MAX_SAMPLES * PERIOD;
+    return endless ? "the step is longer than a million periods" : NULL;
 }
 
 /* Computes x(k+1) and y(k) for the present inputs; `scratch` has room for all of it. */
@@ -98,58 +80,57 @@ static void compute(Model *model, double *scratch)
     model->known = 1;
 }
 
-static ModelStatus ensure_known(Model *model)
+static const char *ensure_known(Model *model)
 {
     if (!model->known) {
         double *scratch = malloc((1 + N_SETTABLE + N_MEMORY + N_WORK) * sizeof *scratch);
-        if (scratch == NULL) return MODEL_NO_MEMORY;
+        if (scratch == NULL) return "out of memory";
         compute(model, scratch);
         free(scratch);
     }
-    if (model->fault == 0.0) return MODEL_OK;
-    return model->fault == FAULT_NOT_DEFINITE ? MODEL_NOT_DEFINITE : MODEL_NOT_FINITE;
+    if (model->fault == 0.0) return NULL;
+    return model->fault == FAULT_NOT_DEFINITE ? "a covariance is not positive definite"
+                                              : "the estimate or the command is not finite";
 }
 
-ModelStatus model_get(Model *model, size_t index, double *value)
+const char *model_get(Model *model, size_t index, double *value)
 {
-    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
     *value = model->values[index];
-    if (index < N_SETTABLE || !model->touched || waits(model)) return MODEL_OK;
-    if (model->time < instant(model) - SAMPLE_SHARE * PERIOD) return MODEL_OK;
-    const ModelStatus status = ensure_known(model);
-    if (status == MODEL_OK) *value = model->answers[index - N_SETTABLE];
-    return status;
+    if (index < N_SETTABLE || !model->touched || waits(model)) return NULL;
+    if (model->time < instant(model) - SAMPLE_SHARE * PERIOD) return NULL;
+    const char *message = ensure_known(model);
+    if (message == NULL) *value = model->answers[index - N_SETTABLE];
+    return message;
 }
 
-static ModelStatus take_sample(Model *model)
+static const char *take_sample(Model *model)
 {
-    const ModelStatus status = ensure_known(model);
-    if (status != MODEL_OK) return status;
+    const char *message = ensure_known(model);
+    if (message != NULL) return message;
     if (!model->begun) model->first = model->time;
     memcpy(model->memory, model->next, sizeof model->memory);
     memcpy(model->values + N_SETTABLE, model->answers, sizeof model->answers);
     model->begun = 1;
     model->sample += 1.0;
     model->known = 0;
-    return MODEL_OK;
+    return NULL;
 }
 
-ModelStatus model_step(Model *model, double step)
+const char *model_step(Model *model, double step)
 {
-    const double end = model->time + step - SAMPLE_SHARE * PERIOD;
-    if (!waits(model) && end - instant(model) > MAX_SAMPLES * PERIOD) return MODEL_TOO_LONG;
+    const double end = last_instant(model, step);
     while (instant(model) < end && !waits(model)) {
-        const ModelStatus status = take_sample(model);
-        if (status != MODEL_OK) return status;
+        const char *message = take_sample(model);
+        if (message != NULL) return message;
     }
     model->touched = 0; /* earlier inputs are not those of the instant at the end of the step */
-    return MODEL_OK;
+    return NULL;
 }
 
-ModelStatus model_settle(Model *model, int *changed)
+const char *model_settle(Model *model, int *changed)
 {
     *changed = 0;
-    return MODEL_OK;
+    return NULL;
 }
 
 int model_next_event(Model *model, char text[MESSAGE_SIZE])
@@ -161,7 +142,7 @@ void model_set_states(Model *model, const double *states)
 {
 }
 
-ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
+const char *model_derive(Model *model, double direction[N_VALUES], int starting)
 {
-    return MODEL_NO_DERIVATIVES;
+    return "the controller is sampled and has no derivatives";
 }

@@ -29,18 +29,6 @@ typedef struct {
     double memory[N_MEMORY];    /* x(k) */
 } Model;
 
-typedef enum {
-    MODEL_OK,
-    MODEL_NO_SUCH_VARIABLE,
-    MODEL_NOT_SETTABLE,
-    MODEL_BAD_VALUE,
-    MODEL_NO_DERIVATIVES,
-    MODEL_TOO_LONG,
-    MODEL_NOT_FINITE, /* this and the following ones end a run */
-    MODEL_NOT_DEFINITE,
-    MODEL_NO_MEMORY
-} ModelStatus;
-
 #include "model_functions.h"
 
 #endif

@@ -1,74 +1,53 @@
 /* FMI 2.0 around `Model`: both interfaces, but for the functions that FMI 3 shares. */
-#include "fmi2_instance.h"
+#include "fmi2Functions.h"
+#include "instance.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-static void tell(const Instance *instance, fmi2Status status, unsigned category, const char *text)
+typedef struct {
+    Core core;
+    unsigned logged; /* bits of categories; errors are always logged */
+    const fmi2CallbackFunctions *callbacks;
+    char name[];
+} Instance;
+
+static void tell(const Instance *instance, fmi2Status status, const char *category, const char *text)
 {
     const fmi2CallbackFunctions *callbacks = instance->callbacks;
-    if (callbacks->logger == NULL || (status < fmi2Error && (instance->logged & (1U << category)) == 0)) return;
-    callbacks->logger(callbacks->componentEnvironment, instance->name, status, log_categories[category], text);
+    if (callbacks->logger == NULL) return;
+    callbacks->logger(callbacks->componentEnvironment, instance->name, status, category, text);
 }
 
-fmi2Status report(const Instance *instance, fmi2Status status, const char *function, const char *message)
-{
-    char text[MESSAGE_SIZE];
-    compose(text, function, message);
-    tell(instance, status, status >= fmi2Error ? 0 : 1, text);
-    return status;
-}
+typedef fmi2Component Handle;
+typedef fmi2Status Status;
+typedef fmi2Boolean Boolean;
+typedef fmi2String String;
+typedef fmi2Byte Byte;
+typedef fmi2FMUstate State;
 
-fmi2Status answer(const Instance *instance, const char *function, const char *message)
-{
-    return message == NULL ? fmi2OK : report(instance, fmi2Error, function, message);
-}
+#define FMI(name) fmi2##name
+#define FMI_STATE(verb, noun) fmi2##verb##FMUstate##noun
+#define DESERIALIZE_STATE fmi2DeSerializeFMUstate
+#define GET_DERIVATIVES fmi2GetDerivatives
+#define DERIVATIVE_PHASES (RUNNING | TERMINATED)
+#define TOKEN_NAME "GUID"
+#include "shared_functions.h"
 
-void report_events(Instance *instance)
-{
-    char text[MESSAGE_SIZE];
-    while ((instance->logged & LOG_EVENTS) && model_next_event(&instance->core.model, text)) tell(instance, fmi2OK, 2, text);
-}
+size_t size_of(unsigned reference) { return reference < N_VALUES; }
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
-
-const char *fmi2GetVersion(void) { return fmi2Version; }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *callbacks, fmi2Boolean visible, fmi2Boolean logging)
 {
     if (callbacks == NULL || name == NULL || guid == NULL) return NULL;
-    Instance *instance = calloc(1, sizeof *instance);
     const size_t size = strlen(name) + 1;
-    char *copy = malloc(size);
-    if (instance == NULL || copy == NULL) {
-        free(instance);
-        free(copy);
-        return NULL;
-    }
-    instance->name = memcpy(copy, name, size);
+    Instance *instance = calloc(1, sizeof *instance + size);
+    if (instance == NULL) return NULL;
+    memcpy(instance->name, name, size);
     instance->callbacks = callbacks;
-    instance->logged = logging ? LOG_ALL : 0;
-    if (strcmp(guid, TOKEN) != 0) {
-        answer(instance, "fmi2Instantiate", "the GUID is not that of this model");
-        fmi2FreeInstance(instance);
-        return NULL;
-    }
-    if (type == fmi2ModelExchange && !HAS_EXCHANGE) {
-        answer(instance, "fmi2Instantiate", "the model is for co-simulation only");
-        fmi2FreeInstance(instance);
-        return NULL;
-    }
-    core_reset(&instance->core, type == fmi2ModelExchange);
-    return instance;
-}
-
-void fmi2FreeInstance(fmi2Component instance)
-{
-    Instance *self = instance;
-    if (self == NULL) return;
-    free(self->name);
-    free(self);
+    return open_instance(instance, __func__, guid, type == fmi2ModelExchange, logging);
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component instance, fmi2Boolean tolerance_defined, fmi2Real tolerance,
@@ -89,23 +68,14 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component instance)
 fmi2Status fmi2GetReal(fmi2Component instance, const fmi2ValueReference references[], size_t count, fmi2Real values[])
 {
     OPEN(INSTANTIATED | READABLE);
-    for (size_t i = 0; i < count; i++) {
-        const char *message = core_get(&self->core, references[i], &values[i]);
-        if (message != NULL) return ANSWER(message);
-    }
-    return fmi2OK;
+    return ANSWER(core_get(&self->core, (Variables){references, count, count}, values));
 }
 
 fmi2Status fmi2SetReal(fmi2Component instance, const fmi2ValueReference references[], size_t count,
                        const fmi2Real values[])
 {
-    OPEN(INSTANTIATED | INITIALISING | RUNNING);
-    for (size_t i = 0; i < count; i++) {
-        const char *message = core_set(&self->core, references[i], values[i]);
-        if (message != NULL) return ANSWER(message);
-    }
-    if (self->core.phase & (INSTANTIATED | INITIALISING)) model_start(&self->core.model);
-    return fmi2OK;
+    OPEN(STARTING | RUNNING);
+    return ANSWER(core_set(&self->core, (Variables){references, count, count}, values));
 }
 
 /* The model has real variables only. */
@@ -128,18 +98,8 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component instance, const fmi2ValueR
                                         fmi2Real sensitivity[])
 {
     OPEN(DIFFERENTIABLE);
-    double direction[N_VALUES] = {0.0};
-    for (size_t i = 0; i < n_knowns; i++) {
-        if (knowns[i] >= N_SETTABLE) return ANSWER("this is no known");
-        direction[knowns[i]] = seed[i];
-    }
-    const ModelStatus status = model_derive(&self->core.model, direction, self->core.phase == INITIALISING);
-    if (status != MODEL_OK) return ANSWER(model_explain(status));
-    for (size_t i = 0; i < n_unknowns; i++) {
-        if (unknowns[i] >= N_VALUES) return ANSWER("this is no unknown");
-        sensitivity[i] = direction[unknowns[i]];
-    }
-    return fmi2OK;
+    const Variables rows = {unknowns, n_unknowns, n_unknowns}, columns = {knowns, n_knowns, n_knowns};
+    return ANSWER(core_derive(&self->core, rows, columns, seed, sensitivity));
 }
 
 /* Co-simulation */
@@ -205,11 +165,9 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component instance, fmi2EventInfo *info)
 {
     OPEN(IN_EVENT);
     int states_changed;
-    const char *message = core_update_discrete_states(&self->core, &states_changed);
+    const char *message = model_settle(&self->core.model, &states_changed);
     memset(info, 0, sizeof *info);
     info->valuesOfContinuousStatesChanged = states_changed;
     report_events(self);
     return ANSWER(message);
 }
-
-#include "shared_functions.h"

@@ -2,7 +2,6 @@
 
 #include <float.h>
 #include <math.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -14,11 +13,8 @@
 
 const char *const log_categories[N_CATEGORIES] = {"logStatusError", "logStatusWarning", "logEvents"};
 
-static double time_tolerance(double time, double step) { return STEP_SHARE * step + ROUNDING * fabs(time); }
-
 void core_reset(Core *core, int exchange)
 {
-    memset(core, 0, sizeof *core);
     model_reset(&core->model, exchange);
     core->stop_time = HUGE_VAL;
     core->phase = INSTANTIATED;
@@ -35,34 +31,24 @@ const char *core_begin(Core *core, double start, int stop_defined, double stop)
 
 const char *core_leave_initialisation(Core *core)
 {
-    const ModelStatus status = model_check(&core->model);
-    if (status == MODEL_OK) core->phase = core->model.exchange ? IN_EVENT : STEPPING;
-    return model_explain(status);
-}
-
-const char *core_get(Core *core, size_t index, double *value)
-{
-    return model_explain(model_get(&core->model, index, value));
-}
-
-const char *core_set(Core *core, size_t index, double value)
-{
-    const int starting = (core->phase & (INSTANTIATED | INITIALISING)) != 0;
-    const ModelStatus status = model_admits(index, starting, (core->phase & EXCHANGING) != 0);
-    return model_explain(status == MODEL_OK ? model_set(&core->model, index, value) : status);
+    const char *message = model_check(&core->model, 0.0);
+    if (message == NULL) core->phase = core->model.exchange ? IN_EVENT : STEPPING;
+    return message;
 }
 
 const char *core_step(Core *core, double time, double step)
 {
     Model *model = &core->model;
     if (!isfinite(step) || step < 0.0) return "the step size is negative or not finite";
-    const double tolerance = time_tolerance(time, step);
+    const double tolerance = STEP_SHARE * step + ROUNDING * fabs(time);
     if (!(fabs(time - model->time) <= tolerance)) return "the communication point is not where the last step ended";
     if (time + step > core->stop_time + tolerance) return "the step ends after the stop time";
     if (step > 0.0) {
-        const ModelStatus status = model_step(model, step);
-        if (status >= MODEL_NOT_FINITE) core->phase = FAILED;
-        if (status != MODEL_OK) return model_explain(status);
+        const char *message = model_check(model, step);
+        if (message != NULL) return message;
+        message = model_step(model, step);
+        if (message != NULL) core->phase = FAILED;
+        if (message != NULL) return message;
     }
     model->time = time + step;
     return NULL;
@@ -74,9 +60,117 @@ const char *core_check_stop_time(const Core *core)
     return time <= core->stop_time + slack ? NULL : "the time is after the stop time";
 }
 
-const char *core_update_discrete_states(Core *core, int *states_changed)
+#define NO_SUCH_VARIABLE "there is no variable with this value reference"
+#define TOO_FEW "too few values for these variables"
+#define TOO_MANY "too many values for these variables"
+
+static const char *get_value(Core *core, size_t index, double *value)
 {
-    return model_explain(model_settle(&core->model, states_changed));
+    if (index < N_VALUES) return model_get(&core->model, index, value);
+    *value = core->model.time; /* the independent variable of FMI 3 */
+    return NULL;
+}
+
+const char *core_get(Core *core, Variables variables, double values[])
+{
+    size_t k = 0;
+    for (size_t i = 0; i < variables.count; i++) {
+        const size_t first = variables.references[i], size = size_of(first);
+        if (size == 0) return NO_SUCH_VARIABLE;
+        if (k + size > variables.n_values) return TOO_FEW;
+        for (size_t j = 0; j < size; j++) {
+            const char *message = get_value(core, first + j, &values[k++]);
+            if (message != NULL) return message;
+        }
+    }
+    return k == variables.n_values ? NULL : TOO_MANY;
+}
+
+static const char *set_value(Core *core, size_t index, double value)
+{
+    /* The states come last; solvers that know no other way may set them one by one. */
+    const size_t end = core->phase & EXCHANGING ? N_SETTABLE : N_SETTABLE - N_STATES;
+    if (index >= end) return "this variable is computed by the model and cannot be set";
+    return model_set(&core->model, index, value, (core->phase & STARTING) != 0);
+}
+
+const char *core_set(Core *core, Variables variables, const double values[])
+{
+    size_t k = 0;
+    for (size_t i = 0; i < variables.count; i++) {
+        const size_t first = variables.references[i], size = first < N_VALUES ? size_of(first) : 0; /* not the time */
+        if (size == 0) return NO_SUCH_VARIABLE;
+        if (k + size > variables.n_values) return TOO_FEW;
+        for (size_t j = 0; j < size; j++) {
+            const char *message = set_value(core, first + j, values[k++]);
+            if (message != NULL) return message;
+        }
+    }
+    if (core->phase & STARTING) model_start(&core->model);
+    return k == variables.n_values ? NULL : TOO_MANY;
+}
+
+/* Whether variables exist, begin below `end` and have as many values as there is room for. */
+static const char *check(Variables variables, size_t end)
+{
+    size_t k = 0;
+    for (size_t i = 0; i < variables.count; i++) {
+        const size_t size = size_of(variables.references[i]);
+        if (size == 0 || variables.references[i] >= end) {
+            return end == N_VALUES ? "this is no unknown" : "this is no known";
+        }
+        k += size;
+    }
+    return k < variables.n_values ? TOO_MANY : k > variables.n_values ? TOO_FEW : NULL;
+}
+
+/* Turns `direction`, set for the knowns, into the derivatives of all values along it. */
+static const char *derive(Core *core, double direction[N_VALUES])
+{
+    return model_derive(&core->model, direction, core->phase == INITIALISING);
+}
+
+const char *core_derive(Core *core, Variables unknowns, Variables knowns, const double seed[], double product[])
+{
+    double direction[N_VALUES] = {0.0};
+    const char *message = check(knowns, N_SETTABLE);
+    if (message == NULL) message = check(unknowns, N_VALUES);
+    for (size_t i = 0; message == NULL && i < knowns.count; seed += size_of(knowns.references[i++])) {
+        memcpy(direction + knowns.references[i], seed, size_of(knowns.references[i]) * sizeof(double));
+    }
+    if (message == NULL) message = derive(core, direction);
+    for (size_t i = 0; message == NULL && i < unknowns.count; product += size_of(unknowns.references[i++])) {
+        memcpy(product, direction + unknowns.references[i], size_of(unknowns.references[i]) * sizeof(double));
+    }
+    return message;
+}
+
+/* The sum of the unknowns along a direction, each times its seed. */
+static double weighed(const double direction[N_VALUES], Variables unknowns, const double seed[])
+{
+    double sum = 0.0;
+    for (size_t i = 0; i < unknowns.count; i++) {
+        const unsigned first = unknowns.references[i];
+        for (size_t j = 0; j < size_of(first); j++) sum += *seed++ * direction[first + j];
+    }
+    return sum;
+}
+
+/* From one direction for each known: the model has some hundred values, and no tape. */
+const char *core_derive_adjoint(Core *core, Variables unknowns, Variables knowns, const double seed[], double product[])
+{
+    const char *message = check(knowns, N_SETTABLE);
+    if (message == NULL) message = check(unknowns, N_VALUES);
+    for (size_t i = 0; message == NULL && i < knowns.count; i++) {
+        const unsigned first = knowns.references[i];
+        for (size_t j = 0; message == NULL && j < size_of(first); j++) {
+            double direction[N_VALUES] = {0.0};
+            direction[first + j] = 1.0;
+            message = derive(core, direction);
+            if (message == NULL) *product++ = weighed(direction, unknowns, seed);
+        }
+    }
+    return message;
 }
 
 /* FNV-1a */
@@ -118,11 +212,6 @@ const char *core_restore(Core *core, const Snapshot *snapshot)
     }
     memcpy(core, &snapshot->core, sizeof *core);
     return NULL;
-}
-
-void compose(char text[MESSAGE_SIZE], const char *function, const char *message)
-{
-    (void)snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
 }
 
 unsigned category_bits(size_t count, const char *const categories[])

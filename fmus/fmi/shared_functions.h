@@ -1,10 +1,60 @@
-/* The functions that FMI 2 and FMI 3 share: they differ in names and types, which the header of the instance defines.
-   One source file of each version includes this. */
+/* The functions that FMI 2 and FMI 3 share. They differ in names and types: the source file of each version defines these,
+   Instance, and `tell`, which passes a message to the importer, and then includes this. */
 #ifndef SHARED_FUNCTIONS_H
 #define SHARED_FUNCTIONS_H
 
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+/* Logs "function: message" and returns the status. Importers without printf formatting get whole texts that way. */
+static Status report(const Instance *instance, Status status, const char *function, const char *message)
+{
+    char text[MESSAGE_SIZE];
+    const int error = status == FMI(Error);
+    (void)snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
+    if (error || (instance->logged & LOG_WARNINGS)) tell(instance, status, log_categories[error ? 0 : 1], text);
+    return status;
+}
+
+/* How a function begins, and how it ends with a message or NULL. */
+#define OPEN(phases)                     \
+    Instance *const self = instance;     \
+    if (self == NULL) return FMI(Error); \
+    if ((self->core.phase & (phases)) == 0) return ANSWER("not allowed in this phase")
+#define ANSWER(message) answer(self, __func__, message)
+
+static Status answer(const Instance *instance, const char *function, const char *message)
+{
+    return message == NULL ? FMI(OK) : report(instance, FMI(Error), function, message);
+}
+
+static void report_events(Instance *instance)
+{
+    char text[MESSAGE_SIZE];
+    while ((instance->logged & LOG_EVENTS) && model_next_event(&instance->core.model, text)) {
+        tell(instance, FMI(OK), log_categories[2], text);
+    }
+}
+
+const char *FMI(GetVersion)(void) { return FMI(Version); }
+
+void FMI(FreeInstance)(Handle instance) { free(instance); }
+
+/* The instance, ready for its start; NULL, and it is freed, if it is not one of this model. */
+static Instance *open_instance(Instance *instance, const char *function, const char *token, int exchange, int logging)
+{
+    const char *message = NULL;
+    if (token == NULL || strcmp(token, TOKEN) != 0) message = "the " TOKEN_NAME " is not that of this model";
+    else if (exchange && !HAS_EXCHANGE) message = "the model is for co-simulation only";
+    if (answer(instance, function, message) != FMI(OK)) {
+        free(instance);
+        return NULL;
+    }
+    instance->logged = logging ? LOG_ALL : 0;
+    core_reset(&instance->core, exchange);
+    return instance;
+}
 
 Status FMI(SetDebugLogging)(Handle instance, Boolean on, size_t count, const String categories[])
 {
@@ -12,7 +62,7 @@ Status FMI(SetDebugLogging)(Handle instance, Boolean on, size_t count, const Str
     const unsigned bits = category_bits(count, categories);
     if (bits == 0) return ANSWER("there is no such category");
     self->logged = on ? self->logged | bits : self->logged & ~bits;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI(ExitInitializationMode)(Handle instance)
@@ -25,14 +75,14 @@ Status FMI(Terminate)(Handle instance)
 {
     OPEN(RUNNING | FAILED);
     self->core.phase = TERMINATED;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI(Reset)(Handle instance)
 {
     OPEN(~0);
     core_reset(&self->core, self->core.model.exchange);
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 /* Saved states */
@@ -44,7 +94,7 @@ Status FMI_STATE(Get, )(Handle instance, State *state)
     if (snapshot == NULL) return ANSWER("out of memory");
     free(*state);
     *state = snapshot;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI_STATE(Set, )(Handle instance, State state)
@@ -58,14 +108,14 @@ Status FMI_STATE(Free, )(Handle instance, State *state)
     OPEN(~0);
     free(*state);
     *state = NULL;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI_STATE(Serialized, Size)(Handle instance, State state, size_t *size)
 {
     OPEN(~0);
     *size = sizeof(Snapshot);
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI_STATE(Serialize, )(Handle instance, State state, Byte bytes[], size_t size)
@@ -73,7 +123,7 @@ Status FMI_STATE(Serialize, )(Handle instance, State state, Byte bytes[], size_t
     OPEN(~0);
     if (state == NULL || size < sizeof(Snapshot)) return ANSWER("no state or no room");
     memcpy(bytes, state, sizeof(Snapshot));
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status DESERIALIZE_STATE(Handle instance, const Byte bytes[], size_t size, State *state)
@@ -83,7 +133,7 @@ Status DESERIALIZE_STATE(Handle instance, const Byte bytes[], size_t size, State
     if (snapshot == NULL) return ANSWER("these bytes are no state of this model");
     free(*state);
     *state = snapshot;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 /* Model exchange */
@@ -100,7 +150,7 @@ Status FMI(EnterContinuousTimeMode)(Handle instance)
 {
     OPEN(EXCHANGING);
     self->core.phase = CONTINUOUS;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 Status FMI(CompletedIntegratorStep)(Handle instance, Boolean no_set_state, Boolean *enter_event, Boolean *terminate)
@@ -115,7 +165,7 @@ Status FMI(SetTime)(Handle instance, double time)
 {
     OPEN(EXCHANGING);
     self->core.model.time = time;
-    return STATUS_OK;
+    return FMI(OK);
 }
 
 static const char *check_count(size_t count, size_t wanted) { return count == wanted ? NULL : "wrong number of values"; }
@@ -131,7 +181,7 @@ Status FMI(SetContinuousStates)(Handle instance, const double states[], size_t c
 static const char *copy_values(Instance *self, size_t offset, size_t wanted, double values[], size_t count)
 {
     const char *message = check_count(count, wanted);
-    for (size_t i = 0; message == NULL && i < count; i++) core_get(&self->core, offset + i, &values[i]);
+    for (size_t i = 0; message == NULL && i < count; i++) model_get(&self->core.model, offset + i, &values[i]);
     return message;
 }
 

@@ -92,20 +92,6 @@ static void find_motion(const Model *model, double motion[6], double rates[6])
     arm_motion(arguments, results, NULL, work, 0);
 }
 
-const char *model_explain(ModelStatus status)
-{
-    switch (status) {
-    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
-    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
-    case MODEL_FIXED: return "this parameter is fixed: it can be set before the end of initialisation only";
-    case MODEL_BAD_VALUE: return "the value is not finite or below the variable's minimum";
-    case MODEL_EMPTY_RANGE: return "joint_lower is not below joint_upper";
-    case MODEL_BEYOND_STOP: return "a joint is beyond its stops joint_lower and joint_upper";
-    case MODEL_NOT_FINITE: return "a joint position is not finite";
-    default: return NULL;
-    }
-}
-
 void model_reset(Model *model, int exchange)
 {
     memset(model, 0, sizeof *model);
@@ -127,27 +113,30 @@ void model_start(Model *model)
     model->stale = STALE_ALL;
 }
 
-static int has_empty_range(const Model *model)
+static const char *check_ranges(const Model *model)
 {
     for (size_t i = 0; i < N_JOINTS; i++) {
-        if (!(model->values[OFFSET_JOINT_LOWER + i] < model->values[OFFSET_JOINT_UPPER + i])) return 1;
+        const double lower = model->values[OFFSET_JOINT_LOWER + i], upper = model->values[OFFSET_JOINT_UPPER + i];
+        if (!(lower < upper)) return "joint_lower is not below joint_upper";
     }
-    return 0;
+    return NULL;
 }
 
-ModelStatus model_check(const Model *model)
+const char *model_check(const Model *model, double step)
 {
-    if (has_empty_range(model)) return MODEL_EMPTY_RANGE;
-    for (size_t i = 0; i < N_JOINTS; i++) {
-        if (upper_room(model, i) < 0.0 || lower_room(model, i) < 0.0) return MODEL_BEYOND_STOP;
+    const char *message = check_ranges(model);
+    for (size_t i = 0; message == NULL && i < N_JOINTS; i++) {
+        const int inside = upper_room(model, i) >= 0.0 && lower_room(model, i) >= 0.0;
+        if (!inside) message = "a joint is beyond its stops joint_lower and joint_upper";
     }
-    return MODEL_OK;
+    return message;
 }
 
-ModelStatus model_settle(Model *model, int *changed)
+const char *model_settle(Model *model, int *changed)
 {
+    const char *message = check_ranges(model);
     *changed = 0;
-    if (has_empty_range(model)) return MODEL_EMPTY_RANGE;
+    if (message != NULL) return message;
     for (size_t i = 0; i < N_JOINTS; i++) {
         const int side = side_met(model, i);
         if (side != 0) {
@@ -162,7 +151,7 @@ ModelStatus model_settle(Model *model, int *changed)
     }
     model_accept(model);
     model->stale = STALE_ALL;
-    return MODEL_OK;
+    return NULL;
 }
 
 /* Finds out which joints are held, unless only events tell. */
@@ -188,18 +177,12 @@ int model_next_event(Model *model, char text[MESSAGE_SIZE])
     return 0;
 }
 
-ModelStatus model_admits(size_t index, int starting, int exchanging)
+const char *model_set(Model *model, size_t index, double value, int starting)
 {
-    /* Solvers that know no other way may set states one by one. */
-    if (index >= OFFSET_JOINT_POSITION && index < N_SETTABLE && !exchanging) return MODEL_NOT_SETTABLE;
-    return !starting && index >= OFFSET_HOME && index < OFFSET_HOME + N_JOINTS ? MODEL_FIXED : MODEL_OK;
-}
-
-ModelStatus model_set(Model *model, size_t index, double value)
-{
-    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
-    if (index >= N_SETTABLE) return MODEL_NOT_SETTABLE;
-    if (!isfinite(value) || value < minima[index]) return MODEL_BAD_VALUE;
+    if (!starting && index >= OFFSET_HOME && index < OFFSET_HOME + N_JOINTS) {
+        return "this parameter is fixed: it can be set before the end of initialisation only";
+    }
+    if (!isfinite(value) || value < minima[index]) return "the value is not finite or below the variable's minimum";
     model->values[index] = value;
     if (index >= OFFSET_JOINT_VELOCITY_COMMAND && index < OFFSET_JOINT_POSITION) {
         model->stale |= STALE_DERIVATIVES;
@@ -207,22 +190,7 @@ ModelStatus model_set(Model *model, size_t index, double value)
         model->stale = STALE_ALL;
     }
     if (index < OFFSET_JOINT_VELOCITY_COMMAND) model->gain_step = -1.0;
-    return MODEL_OK;
-}
-
-static void refresh_kinematics(Model *model, int part)
-{
-    double work[N_WORK], play[N_JOINTS];
-    find_play(model, play);
-    const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
-    if (part == STALE_FEATURE) {
-        double *results[1] = {model->values + OFFSET_FEATURE};
-        arm_feature(arguments, results, NULL, work, 0);
-    } else {
-        double *results[1] = {model->values + OFFSET_JACOBIAN};
-        arm_jacobian(arguments, results, NULL, work, 0);
-    }
-    model->stale &= ~part;
+    return NULL;
 }
 
 /* Free joints meet a stop where its distance crosses zero; held ones are freed where the command does. */
@@ -239,27 +207,36 @@ static void refresh_derivatives(Model *model)
         indicators[1] = held > 0 ? u : upper_room(model, i) + STOP_HYSTERESIS;
     }
     find_motion(model, NULL, model->values + OFFSET_DER_TOOL_DEFLECTION);
-    model->stale &= ~STALE_DERIVATIVES;
 }
 
-ModelStatus model_get(Model *model, size_t index, double *value)
+/* Computes the part of the values that is out of date and holds `index`. */
+static void refresh(Model *model, size_t index)
 {
-    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
+    const int part = index >= OFFSET_JACOBIAN  ? STALE_JACOBIAN
+                     : index >= OFFSET_FEATURE ? STALE_FEATURE
+                                               : STALE_DERIVATIVES;
+    if ((model->stale & part) == 0) return;
+    if (part == STALE_DERIVATIVES) {
+        refresh_derivatives(model);
+    } else {
+        double work[N_WORK], play[N_JOINTS];
+        find_play(model, play);
+        const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
+        double *results[1] = {model->values + (part == STALE_FEATURE ? OFFSET_FEATURE : OFFSET_JACOBIAN)};
+        (part == STALE_FEATURE ? arm_feature : arm_jacobian)(arguments, results, NULL, work, 0);
+    }
+    model->stale &= ~part;
+}
+
+const char *model_get(Model *model, size_t index, double *value)
+{
     if (index >= OFFSET_ENCODER_POSITION && index < OFFSET_FEATURE) {
         *value = encoder_position(model, index - OFFSET_ENCODER_POSITION);
-        return MODEL_OK;
+        return NULL;
     }
-    if (model->stale != 0 && index >= OFFSET_DER_JOINT_POSITION) {
-        if (index >= OFFSET_JACOBIAN) {
-            if (model->stale & STALE_JACOBIAN) refresh_kinematics(model, STALE_JACOBIAN);
-        } else if (index >= OFFSET_FEATURE) {
-            if (model->stale & STALE_FEATURE) refresh_kinematics(model, STALE_FEATURE);
-        } else if (model->stale & STALE_DERIVATIVES) {
-            refresh_derivatives(model);
-        }
-    }
+    if (index >= OFFSET_DER_JOINT_POSITION) refresh(model, index);
     *value = model->values[index];
-    return MODEL_OK;
+    return NULL;
 }
 
 void model_set_states(Model *model, const double *states)
@@ -281,18 +258,18 @@ static void refresh_gains(Model *model, double step)
     model->gain_step = step;
 }
 
-static ModelStatus move_joints(Model *model)
+static const char *move_joints(Model *model)
 {
     double *position = model->values + OFFSET_JOINT_POSITION, *velocity = model->values + OFFSET_JOINT_VELOCITY;
     for (size_t i = 0; i < N_JOINTS; i++) {
         const double u = clipped_command(model, i), v = velocity[i];
         const double q = position[i] + model->drift[i] * v + model->push[i] * u;
-        if (!isfinite(q)) return MODEL_NOT_FINITE;
+        if (!isfinite(q)) return "a joint position is not finite";
         position[i] = clip(q, model->values[OFFSET_JOINT_LOWER + i], model->values[OFFSET_JOINT_UPPER + i]);
         velocity[i] = position[i] == q ? model->decay[i] * v + (1.0 - model->decay[i]) * u : 0.0;
     }
     model_accept(model);
-    return MODEL_OK;
+    return NULL;
 }
 
 /* The tool a step later, in closed form: the velocity of a rigid one is a parabola with the right distance. */
@@ -320,27 +297,23 @@ static double count_parts(const Model *model, double step)
     return whole ? 1.0 : fmin(fmax(1.0, ceil(step / MAX_PART - 1e-9)), MAX_PARTS);
 }
 
-ModelStatus model_step(Model *model, double step)
+const char *model_step(Model *model, double step)
 {
     const double parts = count_parts(model, step), part = step / parts;
     const int flexible = model->values[OFFSET_TOOL_FREQUENCY] > 0.0;
     double before[6], after[6];
-    if (part != model->gain_step) { /* also after a parameter was set */
-        const ModelStatus status = model_check(model);
-        if (status != MODEL_OK) return status;
-        refresh_gains(model, part);
-    }
+    if (part != model->gain_step) refresh_gains(model, part); /* also after a parameter was set */
     if (flexible) find_motion(model, after, NULL);
     for (double done = 0.0; done < parts; done += 1.0) {
-        const ModelStatus status = move_joints(model);
-        if (status != MODEL_OK) return status;
+        const char *message = move_joints(model);
+        if (message != NULL) return message;
         if (!flexible) continue;
         memcpy(before, after, sizeof before);
         find_motion(model, after, NULL);
         swing_tool(model, part, before, after);
     }
     model->stale = STALE_ALL;
-    return MODEL_OK;
+    return NULL;
 }
 
 /* The clipped command's derivative along `direction`. */
@@ -359,7 +332,7 @@ static double derive_acceleration(const Model *model, const double *direction, s
     return (du - direction[OFFSET_JOINT_VELOCITY + i]) / lag - (u - v) / (lag * lag) * dlag;
 }
 
-ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
+const char *model_derive(Model *model, double direction[N_VALUES], int starting)
 {
     hold(model);
     if (starting) {
@@ -382,5 +355,5 @@ ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
                                   direction + OFFSET_STATES, direction};
     double *results[2] = {direction + OFFSET_FEATURE, direction + OFFSET_DER_TOOL_DEFLECTION}; /* the Jacobian follows */
     arm_forward(arguments, results, NULL, work, 0);
-    return MODEL_OK;
+    return NULL;
 }

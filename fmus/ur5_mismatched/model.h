@@ -34,17 +34,6 @@ typedef struct {
     int stale;                   /* which computed values are out of date */
 } Model;
 
-typedef enum {
-    MODEL_OK,
-    MODEL_NO_SUCH_VARIABLE,
-    MODEL_NOT_SETTABLE,
-    MODEL_FIXED,
-    MODEL_BAD_VALUE,
-    MODEL_EMPTY_RANGE,
-    MODEL_BEYOND_STOP,
-    MODEL_NOT_FINITE /* this and the following ones end a run */
-} ModelStatus;
-
 #include "model_functions.h"
 
 #endif

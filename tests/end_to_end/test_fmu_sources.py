@@ -42,10 +42,10 @@ def test_the_sources_of_an_exported_fmu_are_clean(what, version, begin, tmp_path
 def test_a_defect_is_found(tmp_path):
     exported = PRODUCTS["plant"](2)
     write(exported, tmp_path)
-    file = tmp_path / "sources" / "fmi2.c"
+    file = tmp_path / "sources" / "instance.c"
     text = file.read_text()
-    assert text.count("free(copy);") == 1
-    file.write_text(text.replace("free(copy);", ""))
+    assert text.count("free(snapshot);") == 1
+    file.write_text(text.replace("free(snapshot);", ""))
     assert "clang-analyzer-unix.Malloc" in tidy(file).stdout
 
 
@@ -76,6 +76,6 @@ def test_random_calls_touch_no_memory_but_their_own(version, kind, tmp_path):
 
 @NEEDS_SANITIZERS
 def test_a_missing_check_is_found(tmp_path):
-    program = build(tmp_path, arm(3), defect="k + size > n_values")
+    program = build(tmp_path, arm(3), defect="k + size > variables.n_values")
     with pytest.raises(AssertionError, match="AddressSanitizer|runtime error"):
         run(program, CALLS, seed=1)
