@@ -9,6 +9,7 @@ used wherever numpy wants numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from types import SimpleNamespace
@@ -29,39 +30,23 @@ class NotTraceable(ValueError):
     """Code cannot be recorded: it decides by a number of the run, or calls a function that has no expression."""
 
 
+@dataclass(eq=False)
 class Buffer:
-    """Numbers or expressions, which arrays share.
+    """Numbers or expressions, which arrays share."""
 
-    Attributes:
-        content: (N,) numbers, or an expression (N, 1).
-    """
-
-    def __init__(self, content: Any) -> None:  # noqa: ANN401 - numbers or an expression
-        """Store the content."""
-        self.content = content
-
-    @property
-    def constant(self) -> bool:
-        """Whether it holds plain numbers."""
-        return isinstance(self.content, np.ndarray)
+    content: Any  # (N,) numbers, or an expression (N, 1)
 
 
+@dataclass(eq=False)
 class Traced(NDArrayOperatorsMixin):
-    """An array of expressions.
+    """An array of expressions."""
 
-    Attributes:
-        buffer: of its numbers.
-        places: of its entries in the buffer.
-        kind: of its numbers, as numpy's: "b", "i" or "f".
-    """
-
+    buffer: Buffer  # of its numbers
+    places: Places  # of its entries in the buffer
+    kind: str = "f"  # of its numbers, as numpy's: "b", "i" or "f"
     function: ClassVar[Callable[..., Any]]
     """Carries out a function of numpy that is no ufunc; `servobench.fmus.trace.record` sets it."""
     flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
-
-    def __init__(self, buffer: Buffer, places: Places, kind: str = "f") -> None:
-        """Make an array of entries of a buffer."""
-        self.buffer, self.places, self.kind = buffer, places, kind
 
     @classmethod
     def of(cls, expression: Expression, shape: tuple[int, ...], kind: str = "f") -> Traced:
@@ -72,16 +57,13 @@ class Traced(NDArrayOperatorsMixin):
     def plain(cls, numbers: npt.NDArray[Any]) -> Traced:
         """Return an array of numbers to which expressions can be written."""
         kind = numbers.dtype.kind if numbers.dtype.kind in DTYPES else "f"
-        return cls(
-            Buffer(np.array(numbers, dtype=np.float64).reshape(-1)),
-            np.arange(numbers.size).reshape(numbers.shape),
-            kind,
-        )
+        buffer = Buffer(np.array(numbers, dtype=np.float64).reshape(-1))
+        return cls(buffer, np.arange(numbers.size).reshape(numbers.shape), kind)
 
     @property
     def constant(self) -> bool:
         """Whether its entries are plain numbers."""
-        return self.buffer.constant
+        return isinstance(self.buffer.content, np.ndarray)
 
     def numbers(self) -> npt.NDArray[Any]:
         """Return the numbers of a constant array.
@@ -140,14 +122,14 @@ class Traced(NDArrayOperatorsMixin):
         """Return a view, or a copy of the entries that a traced index names along the first axis."""
         if isinstance(key, Traced):
             return self[key.numbers()] if key.constant or key.kind == "b" else picked(self, key)
-        return Traced(self.buffer, np.asarray(self.places[_plain_key(key)]), self.kind)
+        return self.arranged(self.places[as_numbers(key)])
 
     def __setitem__(self, key: Any, value: Any) -> None:  # noqa: ANN401 - any index, any array
         """Write to the buffer."""
-        places = np.asarray(self.places[_plain_key(key)])
+        places = np.asarray(self.places[as_numbers(key)])
         if self.constant and (not isinstance(value, Traced) or value.constant):
             self.buffer.content = self.buffer.content.copy()
-            self.buffer.content[places] = value.numbers() if isinstance(value, Traced) else value
+            self.buffer.content[places] = as_numbers(value)
         else:
             content = casadi.MX(casadi.DM(self.buffer.content) if self.constant else self.buffer.content)
             content.nz[places.reshape(-1).tolist()] = spread(as_traced(value), places.shape).flat()
@@ -204,10 +186,11 @@ METHODS = {
 }  # fmt: skip
 
 
-def _plain_key(key: Any) -> Any:  # noqa: ANN401 - any index
-    if isinstance(key, tuple):
-        return tuple(_plain_key(each) for each in key)
-    return key.numbers() if isinstance(key, Traced) else key
+def as_numbers(value: Any) -> Any:  # noqa: ANN401 - an array, or lists and tuples with arrays in them
+    """Return a value with plain numbers in the place of its constant arrays."""
+    if type(value) in {list, tuple}:
+        return type(value)(map(as_numbers, value))
+    return value.numbers() if isinstance(value, Traced) else value
 
 
 def gathered(content: Expression, places: Places) -> Expression:
@@ -296,8 +279,7 @@ def _carry_out(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Map
     outputs = options.pop("out", None)
     options.pop("dtype", None)
     if all(not isinstance(each, Traced) or each.constant for each in inputs):
-        numbers = [each.numbers() if isinstance(each, Traced) else each for each in inputs]
-        result = getattr(ufunc, method)(*numbers, **_plain_options(options, outputs))
+        result = getattr(ufunc, method)(*map(as_numbers, inputs), **_plain_options(options, outputs))
     elif method == "__call__":
         result = _called(ufunc, inputs, options, outputs)
     elif method == "reduce":
@@ -314,10 +296,10 @@ def _carry_out(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Map
 
 def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's
     """Return the options of a ufunc of numbers; with `where`, the entries that stay are numbers too."""
-    plain = {name: value.numbers() if isinstance(value, Traced) else value for name, value in options.items()}
-    if "where" in plain and outputs is not None:
-        plain["out"] = np.array(outputs[0].numbers())
-    return plain
+    numbers = {name: as_numbers(value) for name, value in options.items()}
+    if "where" in options and outputs is not None:
+        numbers["out"] = np.array(outputs[0].numbers())
+    return numbers
 
 
 def _called(ufunc: np.ufunc, inputs: Sequence[Any], options: Mapping[str, Any], outputs: Any) -> Traced:  # noqa: ANN401

@@ -5,6 +5,7 @@ Linear algebra works matrix by matrix; a matrix that LAPACK would refuse is note
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import combinations
 from typing import Any, Final, NamedTuple
 
 import casadi
@@ -14,11 +15,13 @@ from servobench.fmus.trace.arrays import (
     Expression,
     NotTraceable,
     Traced,
+    as_numbers,
     as_traced,
     choose,
     elementwise,
     joined,
     reduced,
+    spread,
 )
 from servobench.fmus.trace.branches import NOT_DEFINITE, note_fault
 
@@ -41,7 +44,7 @@ def carry_out(function: Callable[..., Any], arguments: Sequence[Any], options: M
         NotTraceable: it has no expression.
     """
     if not _has_expressions([arguments, options]):
-        return function(*_plain(list(arguments)), **{name: _plain(value) for name, value in options.items()})
+        return function(*map(as_numbers, arguments), **{name: as_numbers(value) for name, value in options.items()})
     if function in ARRANGES:
         first, *rest = arguments
         return first.arranged(function(first.places, *rest, **options))
@@ -56,12 +59,6 @@ def _has_expressions(value: Any) -> bool:  # noqa: ANN401 - any tree
         return not value.constant
     values = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
     return any(_has_expressions(each) for each in values)
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - any tree
-    if isinstance(value, Traced):
-        return value.numbers()
-    return type(value)(_plain(each) for each in value) if type(value) in {list, tuple} else value
 
 
 def _joining(function: Callable[..., Any]) -> Callable[..., Traced]:
@@ -106,8 +103,7 @@ def _extreme(name: str) -> Callable[..., Traced]:
     """Return the function that finds the first entry along an axis that none exceeds by a comparison of its name."""
 
     def find(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
-        table = as_traced(array)
-        rows = table.reshape(-1) if axis is None else table.arranged(np.moveaxis(table.places, axis, -1))
+        rows = as_traced(np.ravel(array) if axis is None else np.moveaxis(array, axis, -1))
         best, place = rows[..., 0], Traced.plain(np.zeros(rows.shape[:-1], dtype=np.int_))
         for k in range(1, rows.shape[-1]):
             exceeds = elementwise(name, rows[..., k], best)
@@ -119,8 +115,7 @@ def _extreme(name: str) -> Callable[..., Traced]:
 
 
 def _cumsum(array: Any, axis: int | None = None) -> Traced:  # noqa: ANN401 - as numpy's
-    table = as_traced(array)
-    rows = table.reshape(-1) if axis is None else table.arranged(np.moveaxis(table.places, axis, -1))
+    rows = as_traced(np.ravel(array) if axis is None else np.moveaxis(array, axis, -1))
     sums = [rows[..., 0]]
     for k in range(1, rows.shape[-1]):
         sums.append(elementwise("add", sums[-1], rows[..., k]))
@@ -138,17 +133,14 @@ def _take(array: Any, indices: Any, axis: int | None = None, **options: Any) -> 
 
 
 def _trace(array: Any, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Traced:  # noqa: ANN401 - as numpy's
-    table = as_traced(array)
-    return reduced("add", table.arranged(np.diagonal(table.places, offset, axis1, axis2)), axis=-1)
+    return reduced("add", np.diagonal(array, offset, axis1, axis2), axis=-1)
 
 
 def _diff(array: Any, n: int = 1, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
-    table = as_traced(array)
+    rows = as_traced(np.moveaxis(array, axis, 0))
     for _ in range(n):
-        rows = np.moveaxis(table.places, axis, 0)
-        later, former = (table.arranged(np.moveaxis(part, 0, axis)) for part in (rows[1:], rows[:-1]))
-        table = elementwise("subtract", later, former)
-    return table
+        rows = elementwise("subtract", rows[1:], rows[:-1])
+    return rows.arranged(np.moveaxis(rows.places, 0, axis))
 
 
 def _clip(array: Any, a_min: Any = None, a_max: Any = None, **bounds: Any) -> Traced:  # noqa: ANN401 - as numpy's
@@ -160,9 +152,8 @@ def _clip(array: Any, a_min: Any = None, a_max: Any = None, **bounds: Any) -> Tr
 
 def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     one, other = as_traced(a), as_traced(b)
-    if one.ndim == 1 == other.ndim:
-        return Traced.of(casadi.dot(one.flat(), other.flat()), ())
-    return np.matmul(one, other)  # type: ignore[no-any-return]
+    product: Traced = np.vecdot(one, other) if one.ndim == 1 == other.ndim else np.matmul(one, other)
+    return product
 
 
 def _einsum(subscripts: str, a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
@@ -189,16 +180,10 @@ def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> li
         arrays: (..., m, n).
     """
     lead = np.broadcast_shapes(*(array.shape[:-2] for array in arrays))
-    stacks = []
-    for array in arrays:
-        places = np.broadcast_to(array.places, (*lead, *array.shape[-2:])).reshape(-1, *array.shape[-2:])
-        stacks.append([_matrix(array.arranged(one)) for one in places])
-    results = [function(*matrices) for matrices in zip(*stacks, strict=True)]
-    arranged = []
-    for k, first in enumerate(results[0]):
-        content = casadi.vertcat(*(casadi.vec(result[k].T) for result in results))
-        arranged.append(Traced.of(content, (*lead, *first.shape)))
-    return arranged
+    stacks = (spread(array, (*lead, *array.shape[-2:])).reshape(-1, *array.shape[-2:]) for array in arrays)
+    results = [function(*map(_matrix, matrices)) for matrices in zip(*stacks, strict=True)]
+    columns = (casadi.vertcat(*(casadi.vec(one.T) for one in stack)) for stack in zip(*results, strict=True))
+    return [Traced.of(column, (*lead, *first.shape)) for column, first in zip(columns, results[0], strict=True)]
 
 
 def _matrix(array: Traced) -> Expression:
@@ -298,11 +283,10 @@ def _sweep(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasA
     """Return the function that rotates each pair of columns once, and those of V alike."""
     A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
     own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
-    for p in range(columns):
-        for q in range(p + 1, columns):
-            c, s = _rotation(own[p], own[q])
-            for part in (own, turned):
-                part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
+    for p, q in combinations(range(columns), 2):
+        c, s = _rotation(own[p], own[q])
+        for part in (own, turned):
+            part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
     return casadi.Function(f"sweep_{rows}_{columns}", [A, V], [casadi.horzcat(*own), casadi.horzcat(*turned)])
 
 
@@ -311,12 +295,11 @@ def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of Cas
     A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
     own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
     sizes = [casadi.sqrt(casadi.sumsqr(column)) for column in own]
-    for p in range(columns):
-        for q in range(p + 1, columns):
-            swapped = sizes[p] < sizes[q]
-            for part in (own, turned, sizes):
-                one, other = part[p], part[q]
-                part[p], part[q] = casadi.if_else(swapped, other, one), casadi.if_else(swapped, one, other)
+    for p, q in combinations(range(columns), 2):
+        swapped = sizes[p] < sizes[q]
+        for part in (own, turned, sizes):
+            one, other = part[p], part[q]
+            part[p], part[q] = casadi.if_else(swapped, other, one), casadi.if_else(swapped, one, other)
     left = [casadi.if_else(size > 0.0, column / size, 0.0) for column, size in zip(own, sizes, strict=True)]
     if rows == columns == 3:  # a rotation also where the least value is only a rounding error
         across = casadi.cross(left[0], left[1])

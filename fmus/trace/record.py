@@ -12,9 +12,11 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import _lru_cache_wrapper
+from math import prod
 from pathlib import Path
 from threading import RLock
-from typing import Any, Final
+from traceback import walk_tb
+from typing import Any, Final, TypeAlias
 
 import casadi
 import numpy as np
@@ -25,7 +27,8 @@ from servobench.fmus.trace.branches import frame, leaves_of, symbols_like, with_
 from servobench.fmus.trace.functions import carry_out
 from servobench.plant.contract import checks, lanes
 
-Inputs = Mapping[str, Any]
+Inputs: TypeAlias = Mapping[str, Any]
+Shapes: TypeAlias = Mapping[str, tuple[tuple[int, ...], str]]
 PACKAGE: Final = "servobench."
 OWN: Final = "servobench.fmus."
 _LOCK = RLock()
@@ -86,11 +89,8 @@ def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
     return np.float64 if dtype is _Numpy.float64 else dtype
 
 
-_NUMPY: Final = _Numpy()
-
-
 _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
-    (np, _NUMPY),
+    (np, _Numpy()),
     (lanes.branch, branches.branch),
     (lanes.repeat, branches.repeat),
     (checks.is_finite, branches.is_finite),
@@ -109,7 +109,8 @@ def recording() -> Iterator[None]:
                     continue
                 space = vars(module)
                 for key, value in list(space.items()):
-                    new = meanings.get(id(value), _without_memo(value))
+                    unmemoised = value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
+                    new = meanings.get(id(value), unmemoised)  # a memo must not keep expressions
                     if new is not None:
                         changed.append((space, key, value))
                         space[key] = new
@@ -117,11 +118,6 @@ def recording() -> Iterator[None]:
         finally:
             for space, key, value in changed:
                 space[key] = value
-
-
-def _without_memo(value: Any) -> Callable[..., Any] | None:  # noqa: ANN401 - anything in a module
-    """Return the function behind a memo, which must not keep expressions."""
-    return value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
 
 
 @dataclass(frozen=True)
@@ -141,7 +137,7 @@ def record(
     system: Any,  # noqa: ANN401 - any system
     start: Callable[[Any, Inputs], Any],
     step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
-    inputs: Mapping[str, tuple[tuple[int, ...], str]],
+    inputs: Shapes,
 ) -> Recorded:
     """Record a system.
 
@@ -160,33 +156,22 @@ def record(
         raise NotTraceable("it holds something that is no formula, such as a solver") from error
     try:
         with recording():
-            first, begin = _recorded_start(own, start, inputs)
-            advance = _recorded_step(own, step, inputs, first)
+            values, u = _inputs(inputs)
+            with frame() as faults:
+                first = start(own, values)
+            begin = casadi.Function("controller_start", [u], [_column(first), faults.code], {"cse": True})
+            return Recorded(begin, _recorded_step(own, step, inputs, first))
     except NotTraceable as error:
         raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
     except RuntimeError as error:  # raised by CasADi
         said = str(error).partition("\n")[0]
         raise NotTraceable(f"{_where_it_failed(error)}: CasADi cannot express it ({said})") from error
-    return Recorded(begin, advance)
-
-
-def _recorded_start(
-    system: Any,  # noqa: ANN401 - as `record`
-    start: Callable[[Any, Inputs], Any],
-    inputs: Mapping[str, tuple[tuple[int, ...], str]],
-) -> tuple[Any, Any]:
-    """Return the state at the start and the function that computes it."""
-    values, u = _inputs(inputs)
-    with frame() as faults:
-        tree = start(system, values)
-    column = casadi.vertcat(*map(_column, leaves_of(tree)))
-    return tree, casadi.Function("controller_start", [u], [column, faults.code], {"cse": True})
 
 
 def _recorded_step(
     system: Any,  # noqa: ANN401 - as `record`
     step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
-    inputs: Mapping[str, tuple[tuple[int, ...], str]],
+    inputs: Shapes,
     first: Any,  # noqa: ANN401 - any tree
 ) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that computes a step from a state like the `first`."""
@@ -200,33 +185,30 @@ def _recorded_step(
         raise NotTraceable("its state has other sizes later than at the start")
     x = casadi.MX.sym("x", sum(symbol.size for symbol in symbols))
     parts = casadi.vertsplit(x, np.cumsum([0, *(symbol.size for symbol in symbols)]).tolist())
-    results = [casadi.vertcat(*map(_column, new)), as_traced(output).flat(), faults.code]
+    results = [_column(state), as_traced(output).flat(), faults.code]
     results = casadi.substitute(results, [symbol.buffer.content for symbol in symbols], parts)
     return casadi.Function("controller_step", [x, u], results, {"cse": True})
 
 
-def _inputs(inputs: Mapping[str, tuple[tuple[int, ...], str]]) -> tuple[dict[str, Traced], Expression]:
-    sizes = [int(np.prod(shape)) for shape, _ in inputs.values()]
-    u = casadi.MX.sym("u", sum(sizes))
-    ends = np.cumsum([0, *sizes])
-    values = {}
-    for (name, (shape, kind)), begin in zip(inputs.items(), ends, strict=False):
-        part = u[int(begin) : int(begin) + int(np.prod(shape))]
+def _inputs(inputs: Shapes) -> tuple[dict[str, Traced], Expression]:
+    u = casadi.MX.sym("u", sum(prod(shape) for shape, _ in inputs.values()))
+    values, begin = {}, 0
+    for name, (shape, kind) in inputs.items():
+        part = u[begin : begin + prod(shape)]
         values[name] = Traced.of(part != 0.0 if kind == "b" else part, shape, kind)
+        begin += prod(shape)
     return values, u
 
 
-def _column(leaf: Any) -> Expression:  # noqa: ANN401 - an array
-    return as_traced(leaf).flat()
+def _column(tree: Any) -> Expression:  # noqa: ANN401 - any tree
+    return casadi.vertcat(*(as_traced(leaf).flat() for leaf in leaves_of(tree)))
 
 
 def _where_it_failed(error: BaseException) -> str:
     """Return the innermost function outside of the recorder that an error came through."""
-    found, trace = "the code", error.__traceback__
-    own = Path(__file__).parent
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if Path(code.co_filename).parent != own and "servobench" in str(trace.tb_frame.f_globals.get("__name__", "")):
+    found, own = "the code", Path(__file__).parent
+    for place, _ in walk_tb(error.__traceback__):
+        code = place.f_code
+        if Path(code.co_filename).parent != own and "servobench" in str(place.f_globals.get("__name__", "")):
             found = f"{code.co_qualname} in {inspect.getmodulename(code.co_filename)}"
-        trace = trace.tb_next
     return found
