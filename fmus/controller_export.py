@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from servobench.fmus.model_description import Description, sampled_sections
-from servobench.fmus.product import Product, c_files, documentation, tool, word
+from servobench.fmus.product import Product, c_files, documentation, word
 from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.sources import generated_source
 from servobench.fmus.trace.branches import NOT_DEFINITE
@@ -86,23 +86,29 @@ class ControllerModel:
                 sections=sampled_sections(layout),
                 start=starts,
                 sources=c_files(fmi_version, CORE),
-                tool=tool(),
                 step=self.period,
                 exchange=False,
             ),
-            documentation=self._documentation(layout),
+            documentation=documentation(
+                MODEL,
+                layout,
+                name=self.name,
+                summary=self.summary,
+                period=f"{self.period:g}",
+                memory=str(self.recorded.states),
+                settings=self.settings,
+            ),
             reference=self._reference(layout),
         )
 
     def _constants(self, layout: Layout) -> dict[str, float]:
         parts = self.recorded.start, self.recorded.step
-        pointers = max(size for part in parts for size in (part.sz_arg(), part.sz_res()))
         return {
             "PERIOD": self.period,
             "N_MEMORY": max(self.recorded.states, 1),
-            "N_FEATURES": sum(group.size for group in layout.groups if group.name == SEEN),
+            "N_FEATURES": layout.by_name[SEEN].size,
             "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
-            "N_POINTERS": pointers,
+            "N_POINTERS": max(size for part in parts for size in (part.sz_arg(), part.sz_res())),
             "N_WORK": max(1, *(part.sz_w() for part in parts)),
             "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
             "FAULT_NOT_DEFINITE": NOT_DEFINITE,
@@ -113,14 +119,3 @@ class ControllerModel:
         outputs = self.run.outputs
         before = {name: np.vstack([np.zeros(rows.shape[1]), rows[:-1]]) for name, rows in outputs.items()}
         return replace(self.run, outputs=before).tables(layout)
-
-    def _documentation(self, layout: Layout) -> str:
-        return documentation(
-            MODEL,
-            layout,
-            name=self.name,
-            summary=self.summary,
-            period=f"{self.period:g}",
-            memory=str(self.recorded.states),
-            settings=self.settings,
-        )

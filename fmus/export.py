@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
-from servobench.fmus.model_description import Description, arm_sections
-from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
+from servobench.fmus.model_description import Description, arm_sections, tool
+from servobench.fmus.product import Product, c_files, check_version, documentation, word
 from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
@@ -125,25 +125,32 @@ def fingerprint(options: ExportOptions) -> str:
 
 def product(options: ExportOptions) -> Product:
     """Return the content of the FMU."""
-    layout, start = options.layout, parameters_of(options.model, options.actuation)
-    description = Description(
-        model_name=options.title,
-        model_identifier=options.identifier,
-        summary=options.summary,
-        layout=layout,
-        sections=arm_sections(layout),
-        start=start,
-        sources=c_files(options.fmi_version, CORE),
-        tool=tool(),
-    )
+    layout, view = options.layout, options.view
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
         core=CORE,
         source=kinematics_source(layout),
         constants=arm_constants(layout),
-        description=description,
-        documentation=_documentation(layout, options),
+        description=Description(
+            model_name=options.title,
+            model_identifier=options.identifier,
+            summary=options.summary,
+            layout=layout,
+            sections=arm_sections(layout),
+            start=parameters_of(options.model, options.actuation),
+            sources=c_files(options.fmi_version, CORE),
+        ),
+        documentation=documentation(
+            MODEL,
+            layout,
+            title=options.title,
+            summary=options.summary,
+            joints=str(options.model.arm.n),
+            seen=f" and cameras: {view.setting}" if view else " carries a ball; a fixed camera sees it",
+            feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
+            mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
+        ),
         reference=reference_run(options.model, options.actuation).tables(layout),
     )
 
@@ -152,17 +159,3 @@ def product(options: ExportOptions) -> Product:
 def arm_layout(n: int, view: View | None = None) -> ArmLayout:
     """Return the layout of an arm with `n` joints, with the ball in 3-D by a fixed camera or with another view."""
     return ArmLayout(arm_groups(n, view), view)
-
-
-def _documentation(layout: ArmLayout, options: ExportOptions) -> str:
-    view = options.view
-    return documentation(
-        MODEL,
-        layout,
-        title=options.title,
-        summary=options.summary,
-        joints=str(options.model.arm.n),
-        seen=f" and cameras: {view.setting}" if view else " carries a ball; a fixed camera sees it",
-        feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
-        mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
-    )

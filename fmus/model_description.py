@@ -8,6 +8,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib import metadata
 from typing import TypeAlias
 
 from servobench.fmus.variables import (
@@ -73,13 +74,12 @@ class Section:
 
     def scalars(self) -> Iterable[tuple[int, list[int]]]:
         """Yield index and dependencies of every number; FMI 2 wants them in ascending order."""
-        sizes = {group.name: group.size for group in self.layout.groups}
         for group, names, elementwise in self.unknowns:
             for k in range(group.size):
                 dependencies: list[int] = []
                 for name in names:
                     first = self.layout.offsets[name]
-                    dependencies += [first + k] if elementwise else range(first, first + sizes[name])
+                    dependencies += [first + k] if elementwise else range(first, first + self.layout.by_name[name].size)
                 yield self.layout.offsets[group.name] + k, sorted(dependencies)
 
     def arrays(self) -> Iterable[tuple[int, list[int]]]:
@@ -126,8 +126,7 @@ def sampled_sections(layout: Layout) -> tuple[Section, ...]:
 
 
 def _section(layout: Layout, fmi2: str, fmi3: str, rows: _Rows) -> Section:
-    groups = {group.name: group for group in layout.groups}
-    unknowns = tuple((groups[name], names, elementwise) for name, names, elementwise in rows)
+    unknowns = tuple((layout.by_name[name], names, elementwise) for name, names, elementwise in rows)
     return Section(fmi2, fmi3, layout, unknowns)
 
 
@@ -142,22 +141,30 @@ class Description:
     sections: tuple[Section, ...]  # of the model structure
     start: Mapping[str, FloatArray]  # start values of parameters and inputs, flat arrays by group; else zero
     sources: tuple[str, ...]  # C files to compile, in order
-    tool: str  # name and version of the exporter
     step: float = 0.05  # of the default experiment [s]
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
 
 
+def tool() -> str:
+    """Return name and version of the exporter."""
+    return f"servobench {metadata.version('servobench')}"
+
+
 def write_description(description: Description, version: int, token: str) -> bytes:
     """Return modelDescription.xml of FMI 2.0 or 3.0 with its GUID or instantiation token."""
-    root = ET.Element("fmiModelDescription", fmiVersion=f"{version}.0", modelName=description.model_name)
-    root.attrib["guid" if version == 2 else "instantiationToken"] = token
-    root.attrib["description"] = description.summary
-    root.attrib["generationTool"] = description.tool
-    root.attrib["license"] = "BSD-3-Clause"
-    root.attrib["variableNamingConvention"] = "structured"
+    attributes = {
+        "fmiVersion": f"{version}.0",
+        "modelName": description.model_name,
+        "guid" if version == 2 else "instantiationToken": token,
+        "description": description.summary,
+        "generationTool": tool(),
+        "license": "BSD-3-Clause",
+        "variableNamingConvention": "structured",
+    }
     if version == 2:
         indicators = description.layout.of_role(INDICATOR)
-        root.attrib["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
+        attributes["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
+    root = ET.Element("fmiModelDescription", attributes)
     _interfaces(root, description, version)
     _units(root, {group.unit for group in description.layout.groups})
     categories = ET.SubElement(root, "LogCategories")
@@ -165,8 +172,7 @@ def write_description(description: Description, version: int, token: str) -> byt
         ET.SubElement(categories, "Category", name=name, description=text)
     experiment = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(description.step)}
     ET.SubElement(root, "DefaultExperiment", experiment)
-    variables = ET.SubElement(root, "ModelVariables")
-    (_scalar_variables if version == 2 else _array_variables)(variables, description)
+    _variables(ET.SubElement(root, "ModelVariables"), description, version)
     structure = ET.SubElement(root, "ModelStructure")
     for section in description.sections:
         if version == 3:
@@ -177,7 +183,7 @@ def write_description(description: Description, version: int, token: str) -> byt
             for index, dependencies in section.scalars():
                 attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
                 ET.SubElement(element, "Unknown", attributes)
-    return _bytes(root)
+    return xml_bytes(root)
 
 
 def _interfaces(root: ET.Element, description: Description, version: int) -> None:
@@ -211,7 +217,7 @@ def write_build_description(description: Description) -> bytes:
     for name in description.sources:
         ET.SubElement(files, "SourceFile", name=name)
     ET.SubElement(configuration, "Library", name="m", external="true", description="C's mathematical functions")
-    return _bytes(root)
+    return xml_bytes(root)
 
 
 def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
@@ -231,7 +237,7 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     root = ET.Element("fmiReferences", attributes)
     for source, role, text in files:
         ET.SubElement(root, "Related", type="text/csv", source=source, role=role, description=text)
-    return _bytes(root)
+    return xml_bytes(root)
 
 
 def _units(root: ET.Element, used: set[str]) -> None:
@@ -245,51 +251,35 @@ def _units(root: ET.Element, used: set[str]) -> None:
             ET.SubElement(unit, "DisplayUnit", name=DISPLAY_UNITS[name], factor=repr(180 / math.pi))
 
 
-def _scalar_variables(variables: ET.Element, description: Description) -> None:
+def _variables(parent: ET.Element, description: Description, version: int) -> None:
+    """Add every number of FMI 2, every group and the time of FMI 3."""
     layout = description.layout
     for group in layout.groups:
-        for k, name in enumerate(group.scalar_names()):
-            reference = layout.offsets[group.name] + k
-            variable = ET.SubElement(variables, "ScalarVariable", name=name, valueReference=str(reference))
-            variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description})
-            real = ET.SubElement(variable, "Real", _real(group))
+        first, values = layout.offsets[group.name], description.start.get(group.name)
+        starts = ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
+        for k, name in enumerate(group.scalar_names() if version == 2 else [group.name]):
+            attributes = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
+            attributes["description"] = group.description
+            real = _real(group)
             if group.role in (PARAMETER, FIXED, INPUT):
-                real.attrib["start"] = _starts(description, group)[k]
+                real["start"] = starts[k] if version == 2 else " ".join(starts)
             if group.role == DERIVATIVE:
-                real.attrib["derivative"] = str(layout.offsets[_state_of(group)] + k + 1)
-
-
-def _array_variables(variables: ET.Element, description: Description) -> None:
-    layout = description.layout
-    time = {"causality": "independent", "variability": "continuous", "unit": "s", "description": "Simulation time."}
-    for group in layout.groups:
-        variable = ET.SubElement(variables, "Float64", name=group.name, valueReference=str(layout.offsets[group.name]))
-        variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description} | _real(group))
-        if group.role in (PARAMETER, FIXED, INPUT):
-            variable.attrib["start"] = " ".join(_starts(description, group))
-        if group.role == DERIVATIVE:
-            variable.attrib["derivative"] = str(layout.offsets[_state_of(group)])
-        for size in group.shape:
-            ET.SubElement(variable, "Dimension", start=str(size))
-    ET.SubElement(variables, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
-
-
-def _state_of(group: Group) -> str:
-    return group.name.removeprefix("der(").removesuffix(")")
+                state = layout.offsets[group.name.removeprefix("der(").removesuffix(")")]
+                real["derivative"] = str(state + k + 1 if version == 2 else state)
+            if version == 2:
+                ET.SubElement(ET.SubElement(parent, "ScalarVariable", attributes), "Real", real)
+            else:
+                variable = ET.SubElement(parent, "Float64", attributes | real)
+                for size in group.shape:
+                    ET.SubElement(variable, "Dimension", start=str(size))
+    if version == 3:
+        time = {"causality": "independent", "variability": "continuous", "unit": "s", "description": "Simulation time."}
+        ET.SubElement(parent, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
 
 
 def _real(group: Group) -> dict[str, str]:
-    attributes = {"unit": group.unit, "displayUnit": DISPLAY_UNITS.get(group.unit)}
-    attributes |= {
-        name: None if bound is None else repr(bound)
-        for name, bound in (("min", group.minimum), ("nominal", group.nominal))
-    }
-    return {name: text for name, text in attributes.items() if text is not None}
-
-
-def _starts(description: Description, group: Group) -> list[str]:
-    values = description.start.get(group.name)
-    return ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
+    bounds = {"displayUnit": DISPLAY_UNITS.get(group.unit), "min": group.minimum, "nominal": group.nominal}
+    return {"unit": group.unit} | {name: str(bound) for name, bound in bounds.items() if bound is not None}
 
 
 def _dependent(dependencies: list[int]) -> dict[str, str]:
@@ -299,7 +289,8 @@ def _dependent(dependencies: list[int]) -> dict[str, str]:
     }
 
 
-def _bytes(root: ET.Element) -> bytes:
+def xml_bytes(root: ET.Element) -> bytes:
+    """Return the text of an XML file, one line for each element."""
     ET.indent(root)
     text: str = ET.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()

@@ -11,7 +11,6 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -156,11 +155,6 @@ def documentation(folder: str, layout: Layout, **words: str) -> str:
     ]
     escaped = {name: html.escape(text) for name, text in words.items()}
     return string.Template(committed(folder, "documentation.html")).substitute(escaped, rows="\n".join(rows))
-
-
-def tool() -> str:
-    """Return name and version of the exporter."""
-    return f"servobench {version('servobench')}"
 
 
 def word(text: str, otherwise: str) -> str:

@@ -86,10 +86,8 @@ def read_table(text: str) -> tuple[list[str], FloatArray]:
 
 def table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -> str:
     """Return values by name, (k, size), as CSV with one column for each scalar."""
-    groups = {group.name: group for group in layout.groups}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["time", *(scalar for name in columns for scalar in groups[name].scalar_names())])
-    for row in np.column_stack([time, *columns.values()]):
-        writer.writerow([repr(float(value)) for value in row])
+    writer.writerow(["time", *(scalar for name in columns for scalar in layout.by_name[name].scalar_names())])
+    writer.writerows(np.column_stack([time, *columns.values()]).tolist())
     return text.getvalue()

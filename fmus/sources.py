@@ -28,6 +28,7 @@ from servobench.plant.cameras.symbolic import (
     arm_frames,
     features,
     points_in_cameras,
+    symbolic_rotation,
     valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
@@ -39,6 +40,12 @@ HEAD = """/* Generated with CasADi's code generator; not meant to be edited. */
 #endif
 #define CASADI_SYMBOL_EXPORT
 #include "{name}.h"
+"""
+LAYOUT = """/* Generated from the table of variables; not meant to be edited. */
+#ifndef LAYOUT_H
+#define LAYOUT_H
+{}
+#endif
 """
 
 
@@ -65,36 +72,32 @@ def layout_header(
         token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
     """
     settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
-    lines = [
-        "/* Generated from the table of variables; not meant to be edited. */",
-        "#ifndef LAYOUT_H",
-        "#define LAYOUT_H",
-    ]
-    lines += [f'#define MODEL_NAME "{model_name}"', f'#define TOKEN "{token}"']
-    lines += [f"#define N_GROUPS {len(layout.groups)}", f"#define N_VALUES {layout.size}"]
-    lines += [f"#define N_SETTABLE {sum(group.size for group in settable)}"]
-    lines += [f"#define OFFSET_{_macro(group.name)} {layout.offsets[group.name]}" for group in layout.groups]
-    lines += [f"#define {name} {value!r}" for name, value in constants.items()]
-    sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
     zero = np.zeros(1)
     values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
     minima = [
-        "-HUGE_VAL" if group.minimum is None else float(group.minimum).hex()
-        for group in settable
-        for _ in range(group.size)
+        "-HUGE_VAL" if each.minimum is None else each.minimum.hex() for each in settable for _ in range(each.size)
     ]
-    lines += [f"#define GROUPS {{{sizes}}}"]
-    lines += [_initialiser("START_VALUES", [float(value).hex() for value in values])]
-    lines += [_initialiser("MINIMA", minima), "#endif", ""]
-    return "\n".join(lines)
+    macros = {
+        "MODEL_NAME": f'"{model_name}"',
+        "TOKEN": f'"{token}"',
+        "N_GROUPS": len(layout.groups),
+        "N_VALUES": layout.size,
+        "N_SETTABLE": sum(group.size for group in settable),
+        **{f"OFFSET_{_macro(name)}": offset for name, offset in layout.offsets.items()},
+        **constants,
+        "GROUPS": _initialiser(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups),
+        "START_VALUES": _initialiser(float(value).hex() for value in values),
+        "MINIMA": _initialiser(minima),
+    }
+    return LAYOUT.format("\n".join(f"#define {name} {value}" for name, value in macros.items()))
 
 
 def _macro(name: str) -> str:
     return name.upper().replace("DER(", "DER_").replace(")", "")
 
 
-def _initialiser(name: str, values: list[str]) -> str:
-    return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"
+def _initialiser(values: Iterable[str]) -> str:
+    return "{ \\\n    " + ", \\\n    ".join(values) + "}"
 
 
 @cache
@@ -108,21 +111,15 @@ def arm_constants(layout: ArmLayout) -> dict[str, int]:
     first, *_ = layout.computed
     work = max(function.sz_w() for function in core_functions(layout))
     return {
-        "N_JOINTS": _size(layout, "joint_position"),
-        "N_KINEMATIC": kinematic_size(layout),
+        "N_JOINTS": layout.by_name["joint_position"].size,
         "N_WORK": max(work, 1),
         "OFFSET_FEATURE": layout.offsets[first.name],
     }
 
 
-def kinematic_size(layout: ArmLayout) -> int:
-    """Return the number of kinematic parameters."""
-    return sum(group.size for group in layout.kinematic)
-
-
 def core_functions(layout: ArmLayout) -> list[Any]:
     """Return the four functions of the kinematic core of an arm."""
-    n, size = _size(layout, "joint_position"), kinematic_size(layout)
+    n, size = layout.by_name["joint_position"].size, sum(group.size for group in layout.kinematic)
     s, ds = (casadi.SX.sym(name, 2 * n + 6) for name in ("s", "ds"))
     p, dp = (casadi.SX.sym(name, size) for name in ("p", "dp"))
     c = casadi.SX.sym("c", n)
@@ -142,12 +139,10 @@ def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
     """Return the outputs before the Jacobian, the Jacobian, motion of a rigid tool and rates of a flexible one."""
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
     arm, view, n = _arm(part), layout.view, c.numel()
-    q, v, deflection, w = (s[first:last] for first, last in ((0, n), (n, 2 * n), (2 * n, 2 * n + 3), (-3, None)))
+    q, v, deflection, w = casadi.vertsplit(s, [0, n, 2 * n, 2 * n + 3, 2 * n + 6])
     phase = part["ripple_order"] * q
-    x, slope = (
-        q + part["ripple"] * casadi.sin(phase) + c,
-        1.0 + part["ripple"] * part["ripple_order"] * casadi.cos(phase),
-    )
+    x = q + part["ripple"] * casadi.sin(phase) + c
+    slope = 1.0 + part["ripple"] * part["ripple_order"] * casadi.cos(phase)
     if view is None:
         feature, jacobian, place = _ball(x, part, arm, slope, deflection)
     else:
@@ -167,7 +162,7 @@ def _equations(layout: ArmLayout, s: SX, p: SX, c: SX) -> tuple[SX, SX, SX, SX]:
 
 def _ball(q: SX, part: Mapping[str, SX], arm: ArmGeometry, slope: SX, deflection: SX) -> tuple[SX, SX, SX]:
     """Return the ball in the camera frame, always seen; ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i)) × slope; and p_B."""
-    R_BC = _rotation(part["camera_rpy"])
+    R_BC = symbolic_rotation(part["camera_rpy"])
     axes, origins, rotation, position = arm_frames(q, arm)
     ball = position + rotation @ part["tool"]
     columns = [
@@ -199,7 +194,7 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry
         _objects(part["calibration"], (c, 6)) if view.calibrated else None,
     )
     positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
-    poses = [(_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
+    poses = [(symbolic_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
     return SetupGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
 
 
@@ -209,17 +204,3 @@ def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:
     for k in range(array.size):
         array[k] = values[k]
     return array.reshape(shape)
-
-
-def _rotation(rpy: SX) -> SX:
-    """Rz(yaw) Ry(pitch) Rx(roll), as `servobench.plant.robot.arm.rotation_from_rpy`."""
-    (cr, cp, cy), (sr, sp, sy) = (casadi.vertsplit(f(rpy)) for f in (casadi.cos, casadi.sin))
-    return casadi.vertcat(
-        casadi.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        casadi.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        casadi.horzcat(-sp, cp * sr, cp * cr),
-    )
-
-
-def _size(layout: ArmLayout, name: str) -> int:
-    return next(group.size for group in layout.groups if group.name == name)

@@ -8,8 +8,8 @@ from typing import Final
 
 from servobench.fmus.compiler import Platform
 from servobench.fmus.controller_export import COMMAND, FEATURE, POSITION, SEEN
-from servobench.fmus.model_description import UNITS
-from servobench.fmus.product import Product, tool, write_archive
+from servobench.fmus.model_description import UNITS, tool, xml_bytes
+from servobench.fmus.product import Product, write_archive
 from servobench.fmus.variables import INPUT
 
 SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
@@ -53,8 +53,7 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
     ET.register_namespace("ssc", SSC)
     attributes = {"name": "loop", "version": "1.0", "generationTool": tool()}
     root = ET.Element(f"{{{SSD}}}SystemStructureDescription", attributes)
-    groups = {name: {group.name: group for group in product.description.layout.groups} for name, product in
-              products.items()}  # fmt: skip
+    groups = {name: product.description.layout.by_name for name, product in products.items()}
     feature = BALL if BALL in groups[PLANT] else FEATURE
     measured = (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN))
     wires = [((PLANT, own), (CONTROLLER, wanted)) for own, wanted in measured]
@@ -79,8 +78,7 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
             ET.SubElement(connections, f"{{{SSD}}}Connection", names)
     _units(root, {group.unit for _, group in ends})
     ET.SubElement(root, f"{{{SSD}}}DefaultExperiment", startTime="0", stopTime=repr(stop))
-    ET.indent(root)
-    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root) + b"\n"
+    return xml_bytes(root)
 
 
 def _units(root: ET.Element, used: set[str]) -> None:

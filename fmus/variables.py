@@ -9,7 +9,7 @@ group as an array, `lag`. Both use the group's offset in one flat vector of valu
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import accumulate, product
 from math import prod
 from typing import Final, NamedTuple, Self
 
@@ -183,13 +183,15 @@ class Layout:
     groups: tuple[Group, ...]  # of the model
 
     @cached_property
+    def by_name(self) -> dict[str, Group]:
+        """The groups by name."""
+        return {group.name: group for group in self.groups}
+
+    @cached_property
     def offsets(self) -> dict[str, int]:
         """Offset of each group, which is its value reference."""
-        offsets, offset = {}, 0
-        for group in self.groups:
-            offsets[group.name] = offset
-            offset += group.size
-        return offsets
+        ends = accumulate((group.size for group in self.groups), initial=0)
+        return dict(zip(self.by_name, ends, strict=False))
 
     @property
     def size(self) -> int:
@@ -210,14 +212,12 @@ class ArmLayout(Layout):
     @property
     def kinematic(self) -> tuple[Group, ...]:
         """The parameters of the generated core, which come first."""
-        names = [group.name for group in self.groups]
-        return self.groups[: names.index("lag")]
+        return self.groups[: [*self.by_name].index("lag")]
 
     @property
     def computed(self) -> tuple[Group, ...]:
         """The outputs of the generated core, which come last: the feature first, the Jacobian last."""
-        names = [group.name for group in self.groups]
-        return self.groups[names.index("encoder_position") + 1 :]
+        return self.groups[[*self.by_name].index("encoder_position") + 1 :]
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
         joint_position: q, (n, 1), rad, as reported.
         geometry: symbols or constants for n joints.
     """
-    rotation, position = _rotation(geometry.rpy[0, :]), geometry.translation[0, :].T
+    rotation, position = symbolic_rotation(geometry.rpy[0, :]), geometry.translation[0, :].T
     axes, origins = [], []
     for i in range(joint_position.numel()):
         theta = geometry.gear_ratio[i] * joint_position[i] + geometry.joint_offset[i]
@@ -58,7 +58,7 @@ def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], lis
         origins.append(position)
         rotation = rotation @ _turn_z(theta)
         position = position + rotation @ geometry.translation[i + 1, :].T
-        rotation = rotation @ _rotation(geometry.rpy[i + 1, :])
+        rotation = rotation @ symbolic_rotation(geometry.rpy[i + 1, :])
     return axes, origins, rotation, position
 
 
@@ -158,8 +158,8 @@ def _shows_front(points: Expressions) -> SX:
     return casadi.dot(normal, ray) / lengths > MIN_INCIDENCE
 
 
-def _rotation(rpy: SX) -> SX:
-    """Rz(yaw) Ry(pitch) Rx(roll), as `servobench.plant.robot.arm.rotation_from_rpy`."""
+def symbolic_rotation(rpy: SX) -> SX:
+    """Return Rz(yaw) Ry(pitch) Rx(roll), (3, 3), as `servobench.plant.robot.arm.rotation_from_rpy`."""
     c: SX = casadi.cos(rpy)
     s: SX = casadi.sin(rpy)
     roll = casadi.vertcat(casadi.horzcat(1, 0, 0), casadi.horzcat(0, c[0], -s[0]), casadi.horzcat(0, s[0], c[0]))
