@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from servobench.fmus.compiler import CODE, Platform, this_platform
-from servobench.fmus.model_description import Description, arm_sections, tool
+from servobench.fmus.model_description import Description, arm_sections, exporter
 from servobench.fmus.product import Product, c_files, check_version, documentation, word
 from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
@@ -111,7 +111,7 @@ def fingerprint(options: ExportOptions) -> str:
     and their numbers, and of a set-up that is not one of `plant.cameras` its equations.
     """
     view = options.view
-    parts: list[object] = [tool(), version("casadi"), version("fmpy"), CODE, options.platforms, options.fmi_version]
+    parts: list[object] = [exporter(), version("casadi"), version("fmpy"), CODE, options.platforms, options.fmi_version]
     parts += [options.title, options.identifier, options.summary, None if view is None else view.size]
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]

@@ -70,22 +70,22 @@ class Section:
     fmi2: str
     fmi3: str
     layout: Layout
-    unknowns: tuple[tuple[Group, tuple[str, ...], bool], ...]
+    unknowns: _Rows
 
     def scalars(self) -> Iterable[tuple[int, list[int]]]:
         """Yield index and dependencies of every number; FMI 2 wants them in ascending order."""
-        for group, names, elementwise in self.unknowns:
-            for k in range(group.size):
+        for unknown, names, elementwise in self.unknowns:
+            for k in range(self.layout.by_name[unknown].size):
                 dependencies: list[int] = []
                 for name in names:
                     first = self.layout.offsets[name]
                     dependencies += [first + k] if elementwise else range(first, first + self.layout.by_name[name].size)
-                yield self.layout.offsets[group.name] + k, sorted(dependencies)
+                yield self.layout.offsets[unknown] + k, sorted(dependencies)
 
     def arrays(self) -> Iterable[tuple[int, list[int]]]:
         """Yield value reference and dependencies of every group."""
-        for group, names, _ in self.unknowns:
-            yield self.layout.offsets[group.name], sorted(self.layout.offsets[name] for name in names)
+        for unknown, names, _ in self.unknowns:
+            yield self.layout.offsets[unknown], sorted(self.layout.offsets[name] for name in names)
 
 
 def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
@@ -111,10 +111,10 @@ def arm_sections(layout: ArmLayout) -> tuple[Section, ...]:
     ]
     start += [(name, (*geometry, "home"), False) for name in computed]
     return (
-        _section(layout, "Outputs", "Output", outputs),
-        _section(layout, "Derivatives", "ContinuousStateDerivative", derivatives),
-        _section(layout, "InitialUnknowns", "InitialUnknown", start),
-        _section(layout, "", "EventIndicator", [("stop_indicator", (*state[:1], "joint_velocity_command"), False)]),
+        Section("Outputs", "Output", layout, outputs),
+        Section("Derivatives", "ContinuousStateDerivative", layout, derivatives),
+        Section("InitialUnknowns", "InitialUnknown", layout, start),
+        Section("", "EventIndicator", layout, [("stop_indicator", (*state[:1], "joint_velocity_command"), False)]),
     )
 
 
@@ -122,12 +122,7 @@ def sampled_sections(layout: Layout) -> tuple[Section, ...]:
     """Return outputs and initial unknowns of a system in discrete time: every output depends on every input."""
     inputs = tuple(group.name for group in layout.of_role(INPUT))
     rows: _Rows = [(group.name, inputs, False) for group in layout.of_role(SAMPLED)]
-    return (_section(layout, "Outputs", "Output", rows), _section(layout, "InitialUnknowns", "InitialUnknown", rows))
-
-
-def _section(layout: Layout, fmi2: str, fmi3: str, rows: _Rows) -> Section:
-    unknowns = tuple((layout.by_name[name], names, elementwise) for name, names, elementwise in rows)
-    return Section(fmi2, fmi3, layout, unknowns)
+    return (Section("Outputs", "Output", layout, rows), Section("InitialUnknowns", "InitialUnknown", layout, rows))
 
 
 @dataclass(frozen=True)
@@ -145,7 +140,7 @@ class Description:
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
 
 
-def tool() -> str:
+def exporter() -> str:
     """Return name and version of the exporter."""
     return f"servobench {metadata.version('servobench')}"
 
@@ -157,7 +152,7 @@ def write_description(description: Description, version: int, token: str) -> byt
         "modelName": description.model_name,
         "guid" if version == 2 else "instantiationToken": token,
         "description": description.summary,
-        "generationTool": tool(),
+        "generationTool": exporter(),
         "license": "BSD-3-Clause",
         "variableNamingConvention": "structured",
     }

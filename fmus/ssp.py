@@ -8,7 +8,7 @@ from typing import Final
 
 from servobench.fmus.compiler import Platform
 from servobench.fmus.controller_export import COMMAND, FEATURE, POSITION, SEEN
-from servobench.fmus.model_description import UNITS, tool, xml_bytes
+from servobench.fmus.model_description import UNITS, exporter, xml_bytes
 from servobench.fmus.product import Product, write_archive
 from servobench.fmus.variables import INPUT
 
@@ -51,7 +51,7 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
     """Return the description of the system: components with the connectors in use, and the connections."""
     ET.register_namespace("ssd", SSD)
     ET.register_namespace("ssc", SSC)
-    attributes = {"name": "loop", "version": "1.0", "generationTool": tool()}
+    attributes = {"name": "loop", "version": "1.0", "generationTool": exporter()}
     root = ET.Element(f"{{{SSD}}}SystemStructureDescription", attributes)
     groups = {name: product.description.layout.by_name for name, product in products.items()}
     feature = BALL if BALL in groups[PLANT] else FEATURE
