@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
+from uuid import UUID
 
 from servobench.fmus.compiler import Platform, compile_library, library_files
 from servobench.fmus.model_description import (
@@ -168,8 +169,7 @@ def _token(contents: Mapping[str, bytes]) -> str:
     digest = hashlib.sha256()
     for name in sorted(contents):
         digest.update(name.encode() + b"\0" + contents[name] + b"\0")
-    text = digest.hexdigest()
-    return "{" + "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:32])) + "}"
+    return f"{{{UUID(digest.hexdigest()[:32])}}}"
 
 
 def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "modelDescription.xml") -> None:

@@ -83,8 +83,27 @@ class Traced(NDArrayOperatorsMixin):
         return gathered(self.buffer.content, self.places)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:  # noqa: ANN401
-        """Carry out a ufunc."""
-        return _carry_out(ufunc, method, inputs, options)
+        """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
+
+        Raises:
+            NotTraceable: it has no expression.
+        """
+        outputs = options.pop("out", None)
+        options.pop("dtype", None)
+        if all(not isinstance(each, Traced) or each.constant for each in inputs):
+            result = getattr(ufunc, method)(*map(as_numbers, inputs), **_plain_options(options, outputs))
+        elif method == "__call__":
+            result = _called(ufunc, inputs, options, outputs)
+        elif method == "reduce":
+            result = reduced(ufunc.__name__, inputs[0], **options)
+        else:
+            raise NotTraceable(f"it calls numpy.{ufunc.__name__}.{method}, which has no exported form")
+        if outputs is None:
+            return result
+        if not isinstance(outputs[0], Traced):
+            raise NotTraceable(f"numpy.{ufunc.__name__} writes to an array of numbers")
+        outputs[0][...] = result
+        return outputs[0]
 
     def __array_function__(self, function: Any, types: Any, arguments: Any, options: Any) -> Any:  # noqa: ANN401
         """Carry out another function."""
@@ -267,31 +286,6 @@ COMPARISONS: Mapping[str, Operation] = {
 }  # fmt: skip
 OF_TRUTH: Mapping[str, str] = {"bitwise_and": "logical_and", "bitwise_or": "logical_or", "invert": "logical_not"}
 FROM_TRUTH = {"add": 0.0, "multiply": 1.0, "maximum": -np.inf, "minimum": np.inf, "logical_or": 0.0, "logical_and": 1.0}
-
-
-def _carry_out(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
-
-    Raises:
-        NotTraceable: it has no expression.
-    """
-    options = dict(options)
-    outputs = options.pop("out", None)
-    options.pop("dtype", None)
-    if all(not isinstance(each, Traced) or each.constant for each in inputs):
-        result = getattr(ufunc, method)(*map(as_numbers, inputs), **_plain_options(options, outputs))
-    elif method == "__call__":
-        result = _called(ufunc, inputs, options, outputs)
-    elif method == "reduce":
-        result = reduced(ufunc.__name__, inputs[0], **options)
-    else:
-        raise NotTraceable(f"it calls numpy.{ufunc.__name__}.{method}, which has no exported form")
-    if outputs is None:
-        return result
-    if not isinstance(outputs[0], Traced):
-        raise NotTraceable(f"numpy.{ufunc.__name__} writes to an array of numbers")
-    outputs[0][...] = result
-    return outputs[0]
 
 
 def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's

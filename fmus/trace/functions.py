@@ -86,17 +86,9 @@ def _mean(array: Any, axis: Any = None, keepdims: bool = False) -> Traced:  # no
 
 
 def _reduction(name: str) -> Callable[..., Traced]:
-    def reduce(
-        array: Any,  # noqa: ANN401 - as numpy's, like the others
-        axis: Any = None,  # noqa: ANN401
-        keepdims: bool = False,
-        initial: Any = None,  # noqa: ANN401
-        dtype: Any = None,  # noqa: ANN401
-    ) -> Traced:
-        del dtype
-        return reduced(name, array, axis, keepdims, initial)
-
-    return reduce
+    return lambda array, axis=None, keepdims=False, initial=None, dtype=None: reduced(
+        name, array, axis, keepdims, initial
+    )
 
 
 def _extreme(name: str) -> Callable[..., Traced]:
@@ -132,10 +124,6 @@ def _take(array: Any, indices: Any, axis: int | None = None, **options: Any) -> 
     return (table.reshape(-1) if axis is None else table)[indices]
 
 
-def _trace(array: Any, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Traced:  # noqa: ANN401 - as numpy's
-    return reduced("add", np.diagonal(array, offset, axis1, axis2), axis=-1)
-
-
 def _diff(array: Any, n: int = 1, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
     rows = as_traced(np.moveaxis(array, axis, 0))
     for _ in range(n):
@@ -166,10 +154,6 @@ def _where(condition: Any, *values: Any) -> Traced:  # noqa: ANN401 - as numpy's
     if len(values) != 2:
         raise NotTraceable("it looks for places by numbers that are known in the run only")
     return choose(condition, *values)
-
-
-def _count_nonzero(array: Any, axis: Any = None) -> Traced:  # noqa: ANN401 - as numpy's
-    return reduced("add", elementwise("not_equal", array, 0.0), axis)
 
 
 def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> list[Traced]:
@@ -334,8 +318,10 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
     np.zeros_like: _like(0.0), np.empty_like: _like(0.0), np.ones_like: _like(1.0), np.full_like: _full_like,
     np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
-    np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum, np.trace: _trace,
-    np.clip: _clip, np.dot: _dot, np.einsum: _einsum, np.count_nonzero: _count_nonzero,
+    np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum,
+    np.clip: _clip, np.dot: _dot, np.einsum: _einsum,
+    np.trace: lambda array, *axes, **named: reduced("add", np.diagonal(array, *axes, **named), axis=-1),
+    np.count_nonzero: lambda array, axis=None: reduced("add", elementwise("not_equal", array, 0.0), axis),
     np.copy: lambda array: as_traced(array).copy(),
     np.shape: lambda array: array.shape, np.ndim: lambda array: array.ndim, np.size: lambda array: array.size,
     np.linalg.solve: solve, np.linalg.inv: inverse, np.linalg.cholesky: cholesky,
