@@ -105,16 +105,14 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
     if [np.shape(leaf) for leaf in after] != [np.shape(leaf) for leaf in before]:
         raise NotTraceable(f"the shape of the result of {_name(function)} depends on the run")
     changed = [k for k, (new, old) in enumerate(zip(after, before, strict=True)) if new is not old]
-    parts = [[as_traced(leaves[k]).flat() for k in changed] for leaves in (after, before)]
     inputs = [symbol.buffer.content for symbol in symbols]
     ways = [
-        _function(function, inputs, [*outputs, code])
-        for outputs, code in zip(parts, (faults.code, casadi.MX(0.0)), strict=True)
+        _function(function, inputs, [*(as_traced(leaves[k]).flat() for k in changed), code])
+        for leaves, code in ((after, faults.code), (before, casadi.MX(0.0)))
     ]
     switch = casadi.Function.if_else(f"branch{next(_NUMBERS)}", *ways)
-    results = switch(chosen.flat(), *(given[k].flat() for k in places))
-    results = list(results) if isinstance(results, (tuple, list)) else [results]
-    note_code(results.pop())
+    *results, code = switch.call([chosen.flat(), *(given[k].flat() for k in places)])
+    note_code(code)
     merged = leaves_of(tree)
     for k, expression in zip(changed, results, strict=True):
         kind = max(as_traced(after[k]).kind, as_traced(before[k]).kind, key="bif".index)

@@ -82,14 +82,17 @@ void model_accept(Model *model)
     for (size_t i = 0; i < N_JOINTS; i++) model->driven[i] = gear_position(model, i) + play[i];
 }
 
-/* Place and velocity of the target of a rigid tool, and the derivatives of the tool's states; each may be NULL. */
-static void find_motion(const Model *model, double motion[6], double rates[6])
+typedef int CoreFunction(const double **arg, double **res, int *iw, double *w, int mem);
+
+/* Evaluates a function of the core, along a direction if it takes one; results that are not wanted are NULL. */
+static void evaluate(CoreFunction *function, const Model *model, const double *direction, double *first, double *second)
 {
     double work[N_WORK], play[N_JOINTS];
     find_play(model, play);
-    const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
-    double *results[2] = {motion, rates};
-    arm_motion(arguments, results, NULL, work, 0);
+    const double *states = direction == NULL ? NULL : direction + OFFSET_STATES;
+    const double *arguments[5] = {model->values + OFFSET_STATES, model->values, play, states, direction};
+    double *results[2] = {first, second};
+    function(arguments, results, NULL, work, 0);
 }
 
 void model_reset(Model *model, int exchange)
@@ -206,7 +209,7 @@ static void refresh_derivatives(Model *model)
         indicators[0] = held < 0 ? -u : lower_room(model, i) + STOP_HYSTERESIS;
         indicators[1] = held > 0 ? u : upper_room(model, i) + STOP_HYSTERESIS;
     }
-    find_motion(model, NULL, model->values + OFFSET_DER_TOOL_DEFLECTION);
+    evaluate(arm_motion, model, NULL, NULL, model->values + OFFSET_DER_TOOL_DEFLECTION);
 }
 
 /* Computes the part of the values that is out of date and holds `index`. */
@@ -216,15 +219,9 @@ static void refresh(Model *model, size_t index)
                      : index >= OFFSET_FEATURE ? STALE_FEATURE
                                                : STALE_DERIVATIVES;
     if ((model->stale & part) == 0) return;
-    if (part == STALE_DERIVATIVES) {
-        refresh_derivatives(model);
-    } else {
-        double work[N_WORK], play[N_JOINTS];
-        find_play(model, play);
-        const double *arguments[3] = {model->values + OFFSET_STATES, model->values, play};
-        double *results[1] = {model->values + (part == STALE_FEATURE ? OFFSET_FEATURE : OFFSET_JACOBIAN)};
-        (part == STALE_FEATURE ? arm_feature : arm_jacobian)(arguments, results, NULL, work, 0);
-    }
+    if (part == STALE_DERIVATIVES) refresh_derivatives(model);
+    if (part == STALE_FEATURE) evaluate(arm_feature, model, NULL, model->values + OFFSET_FEATURE, NULL);
+    if (part == STALE_JACOBIAN) evaluate(arm_jacobian, model, NULL, model->values + OFFSET_JACOBIAN, NULL);
     model->stale &= ~part;
 }
 
@@ -303,13 +300,13 @@ const char *model_step(Model *model, double step)
     const int flexible = model->values[OFFSET_TOOL_FREQUENCY] > 0.0;
     double before[6], after[6];
     if (part != model->gain_step) refresh_gains(model, part); /* also after a parameter was set */
-    if (flexible) find_motion(model, after, NULL);
+    if (flexible) evaluate(arm_motion, model, NULL, after, NULL);
     for (double done = 0.0; done < parts; done += 1.0) {
         const char *message = move_joints(model);
         if (message != NULL) return message;
         if (!flexible) continue;
         memcpy(before, after, sizeof before);
-        find_motion(model, after, NULL);
+        evaluate(arm_motion, model, NULL, after, NULL);
         swing_tool(model, part, before, after);
     }
     model->stale = STALE_ALL;
@@ -349,11 +346,7 @@ const char *model_derive(Model *model, double direction[N_VALUES], int starting)
         indicators[0] = held < 0 ? -du : dq - direction[OFFSET_JOINT_LOWER + i];
         indicators[1] = held > 0 ? du : direction[OFFSET_JOINT_UPPER + i] - dq;
     }
-    double work[N_WORK], play[N_JOINTS];
-    find_play(model, play);
-    const double *arguments[5] = {model->values + OFFSET_STATES, model->values, play,
-                                  direction + OFFSET_STATES, direction};
-    double *results[2] = {direction + OFFSET_FEATURE, direction + OFFSET_DER_TOOL_DEFLECTION}; /* the Jacobian follows */
-    arm_forward(arguments, results, NULL, work, 0);
+    /* The Jacobian follows the feature. */
+    evaluate(arm_forward, model, direction, direction + OFFSET_FEATURE, direction + OFFSET_DER_TOOL_DEFLECTION);
     return NULL;
 }
