@@ -238,12 +238,7 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
     whole = longest(tracks)
     axes.plot(whole.time, whole.column(f"reference_{feature}"), **DESIRED)
     for name, track in tracks.items():
-        values = track.column(f"feature_{feature}")
-        if not np.isfinite(values).any():
-            continue
-        axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
-        if not track.completed:
-            mark_end(axes, track.time, values, styles[name])
+        _draw_values(axes, track, track.column(f"feature_{feature}"), name, styles)
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
@@ -255,11 +250,7 @@ def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str
     reach = 0.0
     for label, track in tracks.items():
         error = factor * (track.column(f"true_feature_{feature}") - track.column(f"reference_{feature}"))
-        if not np.isfinite(error).any():
-            continue
-        axes.plot(track.time, error, label=label, **styles[label].line_arguments(len(error)))
-        if not track.completed:
-            mark_end(axes, track.time, error, styles[label])
+        _draw_values(axes, track, error, label, styles)
         late = np.abs(error[len(error) // 2 :])
         reach = max(reach, float(np.max(late[np.isfinite(late)], initial=0.0)))
     if reach > 0.0:
@@ -267,6 +258,14 @@ def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str
         reach = max(AXIS_ROOM * reach, -low, high)
         axes.set_ylim(-reach, reach)
     axes.set_ylabel(f"error in\n{name} [{unit}]")
+
+
+def _draw_values(axes: Axes, track: Track, values: FloatArray, name: str, styles: Styles) -> None:
+    """Draw values of a run over time, if it has some, and its early end."""
+    if np.isfinite(values).any():
+        axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
+        if not track.completed:
+            mark_end(axes, track.time, values, styles[name])
 
 
 def mark_settling_band(axes: Axes, runs: Shown) -> None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any, Final, Literal, NamedTuple, Self
 
 import matplotlib as mpl
@@ -65,9 +66,11 @@ JOINTS: Final = (
 )  # fmt: skip  # colours and lines of joints in their order
 DASHED = (0, (3.5, 1.5))  # of every method as published
 UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
-_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
-_OTHER_LINES = ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-.")
-_OTHER_MARKERS = ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
+_OTHERS: Final[tuple[tuple[Any, ...], ...]] = (
+    (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN),
+    ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-."),
+    ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in ascii_lowercase)),
+)  # colours, lines and markers of unknown methods
 
 
 @dataclass(frozen=True)
@@ -153,11 +156,9 @@ _STYLES = {
     "rls": MethodStyle(SKY, "-", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
 }
-
-
 _STYLES |= {
-    name + PUBLISHED: replace(_STYLES[name], line=DASHED, hollow=True)
-    for name in _STYLES
+    name + PUBLISHED: replace(style, line=DASHED, hollow=True)
+    for name, style in _STYLES.items()
     if name + PUBLISHED in METHODS
 }
 
@@ -385,8 +386,4 @@ def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[
 
 def _other(index: int) -> MethodStyle:
     """Return the style of an unknown method; the first 32 differ in their markers."""
-    return MethodStyle(
-        _OTHER_COLOURS[index % len(_OTHER_COLOURS)],
-        _OTHER_LINES[index % len(_OTHER_LINES)],
-        _OTHER_MARKERS[index % len(_OTHER_MARKERS)],
-    )
+    return MethodStyle(*(known[index % len(known)] for known in _OTHERS))
