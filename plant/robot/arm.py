@@ -138,31 +138,26 @@ class SerialArm:
         return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
 
 
-def arm_from_dh(
-    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, tool: npt.ArrayLike, joint_names: tuple[str, ...]
-) -> SerialArm:
-    """Return the arm of a standard DH table.
+def arm_from_dh(a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...]) -> SerialArm:
+    """Return the arm of a standard DH table, without a ball.
 
     Args:
         a: (n,), m, link lengths.
         d: (n,), m, link offsets.
         alpha: (n,), rad, link twists.
-        tool: (3,), m, ball centre in the flange frame.
         joint_names: n names.
 
     Returns:
-        The arm with gear ratios of 1 and no joint offsets.
+        The arm with gear ratios of 1, no joint offsets and its ball in the flange's origin.
 
     Raises:
         ValueError: a column of the wrong length.
     """
     n = len(joint_names)
-    columns = {name: as_vector(name, value, n) for name, value in (("a", a), ("d", d), ("alpha", alpha))}
     translation, rpy = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
-    translation[1:, 0], translation[1:, 2] = columns["a"], columns["d"]
-    rpy[1:, 0] = columns["alpha"]
-    tool_vector = as_vector("tool", tool, 3)
-    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), tool_vector)
+    translation[1:, 0], translation[1:, 2] = as_vector("a", a, n), as_vector("d", d, n)
+    rpy[1:, 0] = as_vector("alpha", alpha, n)
+    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.zeros(3))
 
 
 def arm_from_modified_dh(
@@ -219,9 +214,6 @@ def narrow_limits(limits: JointLimits | None, n: int, speed: float, reach: float
     Raises:
         ValueError: a speed or a distance that is not positive, or one that leaves a joint no range.
     """
-    speeds, ends = np.full(n, speed), np.full(n, reach)
     if limits is None:
-        return JointLimits(-ends, ends, speeds)
-    return JointLimits(
-        np.maximum(limits.lower, -ends), np.minimum(limits.upper, ends), np.minimum(limits.speed, speeds)
-    )
+        return JointLimits(np.full(n, -reach), np.full(n, reach), np.full(n, speed))
+    return JointLimits(limits.lower.clip(-reach), limits.upper.clip(max=reach), limits.speed.clip(max=speed))

@@ -38,7 +38,8 @@ def find_robot(text: str) -> Robot:
 
     Args:
         text: a key of `ROBOTS`, `random_arm:` and a number, or the path of a file that ends in .yaml (a factory
-            calibration of Universal Robots), .toml (a DH table) or .urdf; each also with the file of a camera.
+            calibration of Universal Robots), .toml (a DH table) or .urdf, and after that #LINK, the link that carries
+            the ball; each also with the file of a camera.
 
     Raises:
         ValueError: an unknown name, or a file that cannot be used.
@@ -78,12 +79,20 @@ def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
 
 @cache
 def _read(text: str, changed: int) -> Robot:
-    from servobench.plant.robot.files import read_robot  # noqa: PLC0415 - only files need their readers
+    from servobench.plant.robot import files  # noqa: PLC0415 - only files need their readers
 
-    path = user_path(text)
-    values = read_toml("robot file", path) if path.suffix.lower() == ".toml" else {}
+    name, _, tip = text.partition("#")
+    path = user_path(name)
+    kind = path.suffix.lower()
+    if kind == ".urdf":
+        return files.read_urdf_robot(path, tip)
+    if tip:
+        raise ValueError(f"robot {text!r}: only a .urdf has links to be named after '#'")
+    if kind != ".toml":
+        return files.read_calibrated_robot(path)
+    values = read_toml("robot file", path)
     if "robot" not in values:
-        return read_robot(text)
+        return files.read_dh_robot(path, values)
     if (named := str(values["robot"])) == text or (robot := find_robot(named)).twin is not None:
         raise ValueError(f"twin {path}: its robot must be the one that controllers know, got the twin {named}")
     twin = read_twin(path, values, robot.arm)
@@ -132,5 +141,5 @@ def _draw_arm(n: int, generator: np.random.Generator) -> SerialArm:
     quarters = generator.choice([-1.0, 0.0, 1.0], n)
     twists = 0.5 * math.pi * quarters + generator.uniform(-SKEW, SKEW, n)
     names = tuple(f"joint_{i}" for i in range(1, n + 1))
-    arm = arm_from_dh(a, d, twists, (0.0, 0.0, 0.0), names)
-    return replace(with_ball(arm), gear_ratio=generator.choice([-1.0, 1.0], n))
+    arm = with_ball(arm_from_dh(a, d, twists, names))
+    return replace(arm, gear_ratio=generator.choice([-1.0, 1.0], n))

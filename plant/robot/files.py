@@ -20,6 +20,7 @@ Of a URDF, read by yourdfpy, the chain with the most rotating joints is taken, w
 
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite, pi
 from pathlib import Path
@@ -30,7 +31,6 @@ from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.faults import configuration_errors
-from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.contract.settings import (
     Check,
     JointSpeed,
@@ -48,26 +48,7 @@ from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_link
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 
-def read_robot(text: str) -> Robot:
-    """Return the robot that a file describes; the suffix decides how it is read.
-
-    Args:
-        text: the path; that of a URDF may end in `#LINK`, the link that carries the ball.
-
-    Raises:
-        ValueError: a file that cannot be used.
-    """
-    name, _, tip = text.partition("#")
-    path = user_path(name)
-    kind = path.suffix.lower()
-    if kind == ".urdf":
-        return read_urdf_robot(path, tip)
-    if tip:
-        raise ValueError(f"robot {text!r}: only a .urdf has links to be named after '#'")
-    return read_dh_robot(path) if kind == ".toml" else _read_calibrated(path)
-
-
-def _read_calibrated(path: Path) -> Robot:
+def read_calibrated_robot(path: Path) -> Robot:
     """Return the robot of the data sheet that a calibration file fits, with the measured arm as the true one.
 
     Raises:
@@ -135,20 +116,18 @@ class DhTable:
 REQUIRED = ("a", "d", "alpha", "joint_lower", "joint_upper", "joint_speed")
 
 
-def read_dh_robot(path: Path) -> Robot:
-    """Return the robot of a DH table.
+def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
+    """Return the robot of a DH table with the content of a file.
 
     Raises:
-        ValueError: the file is missing, malformed, or describes no arm that can work at a table.
+        ValueError: the content is malformed, or describes no arm that can work at a table.
     """
-    values = read_toml("robot file", path)
     for key in REQUIRED:
         if key not in values:
             raise ValueError(f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}")
     if "convention" not in values:
         remark(f'robot file {path} is read by the standard convention; write convention = "standard" or "modified"')
-    blank = DhTable((), (), (), (), (), ())
-    table = override(f"robot file {path}", blank, values)
+    table = override(f"robot file {path}", DhTable((), (), (), (), (), ()), values)
     with configuration_errors(f"robot file {path}: "):
         return _robot_of(table, path)
 
@@ -157,17 +136,14 @@ def _robot_of(table: DhTable, path: Path) -> Robot:
     arm = with_ball(_arm_of(table))
     n = arm.n
     limits = JointLimits(
-        as_vector("joint_lower", table.joint_lower, n),
-        as_vector("joint_upper", table.joint_upper, n),
-        as_vector("joint_speed", table.joint_speed, n),
+        *(as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
     )
     mass, torque = (as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque"))
     links = estimate_links(arm, mass, torque)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     name = table.name or path.stem
-    note = (
-        "" if table.mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
-    )
+    estimated = "masses, inertia and torque limits are estimated from the lengths of the links"
+    note = "" if table.mass else f"{name}: {estimated}"
     return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
 
 
@@ -176,10 +152,8 @@ def _arm_of(table: DhTable) -> SerialArm:
     names = table.joint_names or tuple(f"joint_{i}" for i in range(1, n + 1))
     if len(names) != n:
         raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
-    if table.convention == "standard":
-        arm = arm_from_dh(table.a, table.d, table.alpha, (0.0, 0.0, 0.0), names)
-    else:
-        arm = arm_from_modified_dh(table.a, table.d, table.alpha, names)
+    read = arm_from_dh if table.convention == "standard" else arm_from_modified_dh
+    arm = read(table.a, table.d, table.alpha, names)
     return replace(arm, joint_offset=as_vector("theta", table.theta, n)) if table.theta else arm
 
 
@@ -196,7 +170,7 @@ class Joint(NamedTuple):
     aligned: FloatArray  # (4, 4), the frame whose z axis is the joint's axis, in the frame of the joint's child link
 
 
-def read_urdf_robot(path: Path, tip: str = "") -> Robot:
+def read_urdf_robot(path: Path, tip: str) -> Robot:
     """Return the robot of a URDF.
 
     Args:
@@ -211,11 +185,9 @@ def read_urdf_robot(path: Path, tip: str = "") -> Robot:
         chain, flange, tip = _chain(tree, tip)
         names = tuple(link.joint.name for link in chain)
         origins = np.stack([*(link.origin for link in chain), flange])
-        n = len(chain)
-        bare = SerialArm(
-            names, origins[:, :3, 3], rpy_from_rotation(origins[:, :3, :3]), np.zeros(n), np.ones(n), np.zeros(3)
-        )
-        arm, limits = with_ball(bare), _limits(chain)
+        n, rpy = len(chain), rpy_from_rotation(origins[:, :3, :3])
+        arm = with_ball(SerialArm(names, origins[:, :3, 3], rpy, np.zeros(n), np.ones(n), np.zeros(3)))
+        limits = _limits(chain)
         links, note = _links(tree, chain, arm)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     lines = [f"{path.name}: {n} joints from {names[0]} to {names[-1]}, the ball on {tip}", *([note] if note else [])]
@@ -348,19 +320,16 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     own = [inertials[link.joint.child] for link in chain]
     efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]
     torque = np.array(efforts) if all(isfinite(effort) and effort > 0.0 for effort in efforts) else None
-    missing = [word for word, given in (("torque limits", torque is not None),) if not given]
     if any(inertial is None or not inertial.mass for inertial in own):
-        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{', torque limits' if missing else ''}"
+        further = "" if torque is not None else ", torque limits"
+        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}"
     mass = np.array([inertial.mass for inertial in own], dtype=np.float64)
     for link, each in zip(chain, mass.tolist(), strict=True):
         read_value(f"link {link.joint.child!r}: mass", each, MASS, lambda: "kg")
-    poses = [link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)]
-    centre = np.array([pose[:3, 3] for pose in poses])
-    inertia = np.array(
-        [pose[:3, :3] @ np.asarray(each.inertia) @ pose[:3, :3].T for pose, each in zip(poses, own, strict=True)]
-    )
-    links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
-    return links, "estimated: torque limits" if missing else ""
+    poses = np.array([link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)])
+    R, inertia = poses[:, :3, :3], np.array([inertial.inertia for inertial in own], dtype=np.float64)
+    links = estimate_links(arm, mass, torque, at_far_end(arm, poses[:, :3, 3], R @ inertia @ R.mT))
+    return links, "" if torque is not None else "estimated: torque limits"
 
 
 def _pose(origin: FloatArray | None) -> FloatArray:

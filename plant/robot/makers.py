@@ -26,40 +26,30 @@ from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, 
 
 Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-NO_BALL: Final = (0.0, 0.0, 0.0)
 UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
 PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
 
 
 @dataclass(frozen=True)
 class UniversalRobot:
-    """A row of Universal Robots' tables.
+    """A row of Universal Robots' tables."""
 
-    Attributes:
-        d1, a2, a3, d4, d5, d6: standard DH lengths [m].
-        mass: of the links [kg].
-        centre: of mass, in DH frames [m].
-        torque: of shoulder pan and lift, elbow, and each wrist joint [Nm].
-        speed: of shoulder pan and lift, elbow, and each wrist joint [deg/s].
-        payload: rated load [kg].
-    """
-
-    d1: float
+    d1: float  # standard DH lengths [m], down to d6
     a2: float
     a3: float
     d4: float
     d5: float
     d6: float
-    mass: tuple[float, ...]
-    centre: tuple[Triple, ...]
-    torque: Triple
-    speed: Triple
-    payload: float
+    mass: tuple[float, ...]  # of the links [kg]
+    centre: tuple[Triple, ...]  # of mass, in DH frames [m]
+    torque: Triple  # of shoulder pan and lift, elbow, and each wrist joint [Nm]
+    speed: Triple  # of the same [deg/s]
+    payload: float  # rated load [kg]
 
     def arm(self) -> SerialArm:
         """Return the nominal arm without a ball."""
-        a = (0.0, self.a2, self.a3, 0.0, 0.0, 0.0)
-        return arm_from_dh(a, (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6), ur5.DH_ALPHA, NO_BALL, ur5.JOINT_NAMES)
+        a, d = (0.0, self.a2, self.a3, 0.0, 0.0, 0.0), (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6)
+        return arm_from_dh(a, d, ur5.DH_ALPHA, ur5.JOINT_NAMES)
 
 
 UNIVERSAL_ROBOTS: Final = {title: UniversalRobot(**row) for title, row in ur5.ARMS["universal_robots"].items()}
@@ -178,30 +168,24 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     import yaml  # noqa: PLC0415 - lists of names start without it
 
     path = ur5.shipped_calibration() if path is None else path
+    keys = ("x", "y", "z", "roll", "pitch", "yaw")
+    wanted = f"the blocks {', '.join(CALIBRATION_BLOCKS)}, each with {', '.join(keys)}"
     try:
         blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]
-        keys = ("x", "y", "z", "roll", "pitch", "yaw")
         table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
     except OSError as error:
         raise ValueError(f"calibration file {path} cannot be read: {error.strerror}") from error
     except yaml.YAMLError as error:
         raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
     except KeyError as error:
-        raise ValueError(
-            f"calibration file {path} lacks {error}; wanted 'kinematics' with the blocks "
-            f"{', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
-        ) from error
+        raise ValueError(f"calibration file {path} lacks {error}; wanted 'kinematics' with {wanted}") from error
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"calibration file {path} holds something that is not a number where one is wanted: 'kinematics' has the "
-            f"blocks {', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
-        ) from error
+        came = "holds something that is not a number where one is wanted"
+        raise ValueError(f"calibration file {path} {came}: 'kinematics' has {wanted}") from error
     if not np.isfinite(table).all():
         raise ValueError(f"calibration file {path} holds a number that is not finite")
-    n = len(CALIBRATION_BLOCKS)
-    flange = np.zeros((1, 3))
-    translation, rpy = np.vstack([table[:, :3], flange]), np.vstack([table[:, 3:], flange])
-    return SerialArm(ur5.JOINT_NAMES, translation, rpy, np.zeros(n), np.ones(n), as_vector("tool", tool, 3))
+    n, rows = len(table), np.vstack([table, np.zeros(6)])  # the flange is where the last joint is
+    return SerialArm(ur5.JOINT_NAMES, rows[:, :3], rows[:, 3:], np.zeros(n), np.ones(n), as_vector("tool", tool, 3))
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:

@@ -5,9 +5,12 @@ and torques); inertia tensors by the cylinder approximation that the vendor's RO
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
 
 from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import with_tuples
@@ -44,7 +47,7 @@ TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
 
 def ur5_arm() -> SerialArm:
     """Return the UR5 by its data sheet."""
-    return arm_from_dh(DH_A, DH_D, DH_ALPHA, TOOL, JOINT_NAMES)
+    return replace(arm_from_dh(DH_A, DH_D, DH_ALPHA, JOINT_NAMES), tool=np.array(TOOL))
 
 
 def shipped_calibration() -> Path:

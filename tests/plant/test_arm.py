@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
@@ -72,7 +74,7 @@ def test_dh_arm_equals_the_explicit_product_of_elementary_matrices():
 
 
 def test_planar_arm_matches_the_hand_computed_position_and_jacobian():
-    arm = arm_from_dh([2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0, 0.0], ("shoulder", "elbow"))
+    arm = arm_from_dh([2.0, 1.0], [0.0, 0.0], [0.0, 0.0], ("shoulder", "elbow"))
     q = np.array([np.pi / 2, -np.pi / 2])  # upper arm along y, forearm along x
     np.testing.assert_allclose(arm.ball_position(q), [1.0, 2.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(arm.ball_jacobian(q), [[-2.0, 0.0], [1.0, 1.0], [0.0, 0.0]], atol=1e-15)
@@ -211,8 +213,8 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: arm_from_dh([1.0], [0.0, 0.0], [0.0, 0.0], TOOL, ("i", "j")), r"a must have shape \(2,\), got \(1,\)"),
-        (lambda: arm_from_dh([1.0], [0.0], [0.0], [0.0], ("i",)), r"tool must have shape \(3,\)"),
+        (lambda: arm_from_dh([1.0], [0.0, 0.0], [0.0, 0.0], ("i", "j")), r"a must have shape \(2,\), got \(1,\)"),
+        (lambda: replace(arm_from_dh([1.0], [0.0], [0.0], ("i",)), tool=np.zeros(1)), r"tool must have shape \(3,\)"),
         (lambda: ur5_arm().ball_position(np.zeros(5)), r"joint_position must have shape \(..., 6\), got \(5,\)"),
         (
             lambda: SerialArm(("i",), np.zeros((1, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.zeros(3)),
