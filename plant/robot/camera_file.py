@@ -82,16 +82,15 @@ class Pose(Place):
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a quarter of a second, which lists do not need
 
         given = np.array(self.rotation) if len({np.size(row) for row in self.rotation}) == 1 else np.zeros(0)
-        pose = np.eye(4)
         if given.shape == (4,) and abs(np.linalg.norm(given) - 1.0) < ROUNDED:
-            pose[:3, :3] = Rotation.from_quat(given).as_matrix()
+            rotation = Rotation.from_quat(given)
         elif given.shape == (3, 3) and np.abs(given @ given.T - np.eye(3)).max() < ROUNDED < np.linalg.det(given):
-            pose[:3, :3] = Rotation.from_matrix(given).as_matrix()
+            rotation = Rotation.from_matrix(given)
         else:
-            raise ValueError(
-                f"pose.rotation must be a rotation matrix or a quaternion of length 1, got {self.rotation}"
-            )
-        pose[:3, 3] = self.position or 0.0
+            wanted = "a rotation matrix or a quaternion of length 1"
+            raise ValueError(f"pose.rotation must be {wanted}, got {self.rotation}")
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), self.position or 0.0
         return pose
 
 
@@ -232,10 +231,8 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
     parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
     if any(each not in (None, 0, 1, keys["width"], keys["height"]) for each in parts):
-        remedy = "write size and matrix of the image as it comes into a TOML"
-        raise ValueError(
-            f"{path.name} is of a larger image, of which binning or a region (roi) leaves a part; {remedy}"
-        )
+        part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
+        raise ValueError(f"{path.name} is of a larger image, of which {part}")
     return keys | {"matrix": in_rows(keys["matrix"])}
 
 
@@ -300,10 +297,8 @@ def _check(camera: OwnCamera) -> None:
     s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
     far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
     if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
-        image = f"an image of {keys.width} × {keys.height} px before its corners"
-        raise ValueError(
-            f"distortion {list(camera.distortion)} folds {image}, with this matrix; take them from one calibration"
-        )
+        image = f"an image of {keys.width} × {keys.height} px before its corners, with this matrix"
+        raise ValueError(f"distortion {list(camera.distortion)} folds {image}; take them from one calibration")
     squares = np.linspace(0.0, math.hypot(*far) ** 2)
     radial, tangential = squares * (k1 + squares * (k2 + squares * k3)), 3.0 * math.hypot(p1, p2) * np.sqrt(squares)
     if (moved := (np.abs(radial) + tangential).max()) > MAX_MOVED:

@@ -26,10 +26,7 @@ WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a postu
 
 
 class RobotModel(ABC):
-    """An arm and its cameras, y = h(q) and J = ∂h/∂q; pure, over leading axes.
-
-    The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
-    """
+    """An arm and its cameras, y = h(q) and J = ∂h/∂q; pure, over leading axes."""
 
     arm: SerialArm
     """The arm."""

@@ -30,6 +30,7 @@ CLOSE_ENOUGH: Final = 1e-6  # [m] a point counts as reached, and the search for 
 FIRST_DAMPING: Final = 1e-2  # [m²]
 DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
 SHRINK, GROW = 0.3, 4.0  # factors on the damping after an accepted and after a rejected step
+Limits = tuple[FloatArray, FloatArray]  # lower and upper joint positions, (n,) and (n,) [rad]
 
 
 def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike) -> FloatArray:
@@ -45,8 +46,10 @@ def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike,
         (...) [m]; of a point that can be reached, at most `CLOSE_ENOUGH`.
     """
     target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
-    first = _starts(STARTS, target.shape[:-1], low, high)
-    _, distance = _search(arm, target, first, low, high, lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
+    lead, n = target.shape[:-1], len(low)  # all points have the same starts, within a turn
+    drawn = np.random.default_rng(0).uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (STARTS, n))
+    starts = np.broadcast_to(drawn.reshape(STARTS, *(1,) * len(lead), n), (STARTS, *lead, n)).copy()
+    _, distance = _search(arm, target, starts, (low, high), lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
     return np.asarray(distance.min(axis=0))
 
 
@@ -66,26 +69,15 @@ def reach_for(
         Joint positions (k, n) [rad], and how far the ball is from the point (k,) [m].
     """
     target = np.broadcast_to(point, (len(starts), 3))
-    return _search(arm, target, starts, lower, upper, lambda distance: ~(distance > CLOSE_ENOUGH))
+    return _search(arm, target, starts, (lower, upper), lambda distance: ~(distance > CLOSE_ENOUGH))
 
 
 def _search(
-    arm: SerialArm,
-    target: FloatArray,
-    q: FloatArray,
-    lower: FloatArray,
-    upper: FloatArray,
-    find: Callable[[FloatArray], BoolArray],
+    arm: SerialArm, target: FloatArray, q: FloatArray, limits: Limits, find: Callable[[FloatArray], BoolArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return joint positions (starts, ..., n) [rad] near the target and their distances from it, (starts, ...) [m].
+    """Return joint positions (starts, ..., n) rad near targets (..., 3) m, and their distances from it (starts, ...) m.
 
-    Args:
-        arm: one arm, or arms.
-        target: (..., 3) [m].
-        q: (starts, ..., n) [rad], where the search begins.
-        lower: (n,) [rad].
-        upper: (n,) [rad].
-        find: from the distances to where the search is over.
+    The search begins at `q`, (starts, ..., n) rad, and is over where `find` says so of the distances.
     """
     error, J = _error(arm, target, q)
     distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
@@ -93,7 +85,7 @@ def _search(
         found = find(distance)
         if found.all():
             break
-        tried = _step(q, error, J, damping, lower, upper)
+        tried = _step(q, error, J, damping, *limits)
         new_error, new_J = _error(arm, target, tried)
         nearer = (norm(new_error) < distance) & ~found
         q = np.where(nearer[..., None], tried, q)
@@ -101,12 +93,6 @@ def _search(
         distance = norm(error)
         damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
     return q, distance
-
-
-def _starts(count: int, lead: tuple[int, ...], lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return the starts of the search, (count, ..., n) rad: the same for every point, within a turn."""
-    drawn = np.random.default_rng(0).uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower)))
-    return np.broadcast_to(drawn.reshape(count, *(1,) * len(lead), -1), (count, *lead, len(lower))).copy()
 
 
 def _error(arm: SerialArm, target: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:

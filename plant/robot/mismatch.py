@@ -141,16 +141,11 @@ class Mismatch:
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
         """
-        axes = [
-            (axis, str(magnitude), str(magnitude) if magnitude.unit in PIXELS else magnitude.size(axis))
-            for axis, magnitude in self.axes
-            if axis in SENSOR_AXES
-        ]
+        sensed = [(axis, each) for axis, each in self.axes if axis in SENSOR_AXES]
+        geared = [(axis, each) for axis, each in self.axes if axis in MECHANICS_AXES]
+        axes = [(axis, str(each), str(each) if each.unit in PIXELS else each.size(axis)) for axis, each in sensed]
         own = {f"sensing.{name}": value for name, value in sensor_settings(axes).items()}
-        mechanical = {
-            MECHANICS_AXES[axis].setting: each.size(axis) for axis, each in self.axes if axis in MECHANICS_AXES
-        }
-        return own | {f"mechanics.{name}": value for name, value in mechanical.items()}
+        return own | {f"mechanics.{MECHANICS_AXES[axis].setting}": each.size(axis) for axis, each in geared}
 
     @property
     def camera_exact(self) -> bool:
@@ -202,16 +197,14 @@ def parse_range(name: str, text: str) -> list[float] | list[int]:
 
 
 def _range(name: str, text: str, begin: float, end: float, step: float) -> list[float]:
-    steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
+    steps, what = (end - begin) / step + 1e-9 if step > 0.0 else -1.0, f"the range {text!r} of {name}"
     if not steps < MAX_MAGNITUDES:
-        raise ValueError(f"the range {text!r} of {name} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
+        raise ValueError(f"{what} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
     if steps < 0.0:  # it begins beyond its end
-        raise ValueError(f"the range {text!r} of {name} is empty")
+        raise ValueError(f"{what} is empty")
     values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
     if steps - math.floor(steps) > 1e-6:
-        raise ValueError(
-            f"the range {text!r} of {name} must be begin:end:step, but its last step ends at {values[-1]:g}"
-        )
+        raise ValueError(f"{what} must be begin:end:step, but its last step ends at {values[-1]:g}")
     return values
 
 
@@ -392,6 +385,5 @@ def _not_a_magnitude(axis: str, text: str) -> ValueError:
     if re.fullmatch(r"\s*-\s*[0-9.]+\s*[a-z%]*\s*", text):
         return ValueError(f"{axis} has no sign, as each robot draws one where there is one; got {text!r}")
     names = ", ".join(repr(unit) if unit else "none" for unit in units)
-    return ValueError(
-        f"mismatch axis {axis} needs a magnitude with one of the units {names}, such as {axis}={example}; got {text!r}"
-    )
+    wanted = f"a magnitude with one of the units {names}, such as {axis}={example}"
+    return ValueError(f"mismatch axis {axis} needs {wanted}; got {text!r}")

@@ -154,12 +154,9 @@ def estimate_links(
 
 def _holding_torque(length: FloatArray, mass: FloatArray, payload: float) -> FloatArray:
     """Return the torque limits, (n,) Nm, that follow from the weight of the level, stretched arm beyond each joint."""
-    n = len(length)
     ends = np.cumsum(length)
-    middles = ends - length / 2.0
-    starts = ends - length
-    torque = [
-        GRAVITY * (float(mass[i:] @ (middles[i:] - starts[i])) + payload * float(ends[-1] - starts[i]))
-        for i in range(n)
+    starts, middles = ends - length, ends - length / 2.0
+    loads = [
+        float(mass[i:] @ (middles[i:] - start)) + payload * float(ends[-1] - start) for i, start in enumerate(starts)
     ]
-    return np.maximum(TORQUE_FACTOR * np.array(torque), LEAST_TORQUE)
+    return np.maximum(TORQUE_FACTOR * (GRAVITY * np.array(loads)), LEAST_TORQUE)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
@@ -30,7 +31,7 @@ REACH: Final = (0.35, 0.75)  # [m] from a UR5's shoulder to the ball: away from 
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
 R_BC_DOWN: Final = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
-Clear = Callable[[FloatArray], npt.NDArray[np.bool_]]
+Clear = Callable[[FloatArray], BoolArray]
 Move = tuple[FloatArray, FloatArray]  # start and target, (n,) and (n,) [rad]
 
 
@@ -78,8 +79,6 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
     pose[:3, 3] = np.asarray(centre) - distance * pose[:3, 2]
     return pose
 
-
-BoolArray = npt.NDArray[np.bool_]
 
 HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
@@ -277,22 +276,19 @@ def _at_height(
 ) -> tuple[float, Workspace] | None:
     """Return the workspace at a height and the fit share of its box; None where no home is found."""
     scale = length_scale(arm)
-    centre = scale * (np.array(CENTRE) + np.array([0.0, 0.0, height]))
+    lift = np.array([0.0, 0.0, height])
+    centre = scale * (np.array(CENTRE) + lift)
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
     lower, upper = limits
     clear = Clearance(arm, link_tubes(arm, *shapes), lower, upper, pose, scale, BALL_RADIUS * scale)
     rng = np.random.default_rng(0)
     postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
     clear = replace(clear, pairs=collision_pairs(clear, postures))
-    lift = np.array([0.0, 0.0, height])
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
     if home is None:
         return None
     share, box = _find_box(clear, home)
-    moves = {
-        name: _move(clear, home, scale * (np.array(start) + lift), scale * (np.array(target) + lift))
-        for name, (start, target) in MOVES.items()
-    }
+    moves = {name: _move(clear, home, *(scale * (np.array(ends) + lift))) for name, ends in MOVES.items()}
     stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), postures)
     shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
     return share, Workspace(scale, centre, shoulder, home, *box, moves, stretched, clear)
@@ -308,8 +304,7 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
         return None
     order = np.argsort(WINDING * norm(fit) - clear.gain(fit) / clear.scale, kind="stable")[:CANDIDATES]
     shares = [_find_box(clear, home)[0] for home in fit[order]]
-    home: FloatArray = fit[order[int(np.argmax(shares))]]
-    return home
+    return np.asarray(fit[order[int(np.argmax(shares))]])
 
 
 def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
@@ -367,5 +362,4 @@ def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: Fl
     fit = q[clear(q, singular=True)]
     if not len(fit):
         fit = np.vstack([home, postures[clear(postures, singular=True)]])
-    stretched: FloatArray = fit[np.argmin(clear.gain(fit))]
-    return stretched
+    return np.asarray(fit[np.argmin(clear.gain(fit))])
