@@ -16,7 +16,6 @@ K_p = ω_v/4, ω_i = ω_v/10. Friction is taken implicitly, so that a joint stic
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import casadi
@@ -27,6 +26,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.settings import DriveConfig
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
+Arrays: TypeAlias = tuple[FloatArray, ...]
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
 # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
 POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
@@ -42,6 +42,7 @@ class DriveState(NamedTuple):
     reference: FloatArray  # r [rad]
     reference_speed: FloatArray  # c [rad/s]
     integral: FloatArray  # z [Nm]
+    acceleration: FloatArray  # [rad/s²] from which MuJoCo's solver starts; 0 with PyBullet
 
 
 class RigidBody(NamedTuple):
@@ -55,9 +56,7 @@ class RigidBody(NamedTuple):
 class InPlace:
     """A function of CasADi that reads its arguments and writes its results in place."""
 
-    def __init__(
-        self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
-    ) -> None:
+    def __init__(self, function: casadi.Function, arguments: Arrays, results: Arrays) -> None:
         """Take arrays without gaps; no result shares memory with an argument."""
         self._arrays = *arguments, *results  # The function keeps pointers to these arrays.
         self._buffer: Any
@@ -89,12 +88,7 @@ class Drives:
     """
 
     def __init__(
-        self,
-        config: DriveConfig,
-        lag: float,
-        assumed_inertia: FloatArray,
-        stops: tuple[FloatArray, FloatArray],
-        body: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+        self, config: DriveConfig, lag: float, assumed_inertia: FloatArray, stops: Arrays, body: Arrays | None = None
     ) -> None:
         """Compute the gains.
 
@@ -130,16 +124,18 @@ class Drives:
     def start(self, angle: FloatArray, body: RigidBody) -> DriveState:
         """Return joints at rest at `angle` (n,) [rad] whose integrals carry the rest of the gravity."""
         rest = np.zeros(len(angle))
-        return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
+        return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity, rest)
 
     def take(self, state: DriveState, command: FloatArray) -> None:
         """Set the state of joints and loops, and the command (n,) [rad/s]."""
         self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
-        self._loops[:] = state[2:]
+        self._loops[:] = state.reference, state.reference_speed, state.integral
 
     def give(self) -> DriveState:
         """Return the present state, as arrays that never change."""
-        return DriveState(self.angle.copy(), self.speed.copy(), *self._loops.copy())
+        reference, speed, integral = self._loops.copy()
+        rest = np.zeros(len(integral))
+        return DriveState(self.angle.copy(), self.speed.copy(), reference, speed, integral, rest)
 
     def step(self) -> None:
         """Advance the loops by a physics step: joints stay where they are; `torque` and `drag` are for this step."""

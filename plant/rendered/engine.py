@@ -6,10 +6,11 @@ Joint angles here are the true ones, θ; the world frame W is the arm's base fra
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window
+from servobench.plant.rendered.drives import DriveState
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import Box, DriveConfig
 from servobench.plant.robot.arm import SerialArm
@@ -77,17 +78,14 @@ class Overlap(NamedTuple):
 
 
 class Simulation(ABC):
-    """An arm with mass and drives among obstacles; methods take its state and return a new one.
-
-    A state has the joint angles θ as its `angle`, (n,) [rad].
-    """
+    """An arm with mass and drives among obstacles; methods take its state and return a new one."""
 
     @abstractmethod
-    def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - an immutable value of its own, as below
+    def start(self, angle: FloatArray) -> DriveState:
         """Return joints at rest at `angle` (n,) [rad] with drives that carry the arm's weight."""
 
     @abstractmethod
-    def advance(self, joints: Any, speed: FloatArray, steps: int) -> Any:  # noqa: ANN401
+    def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
         """Return the joints some physics steps later.
 
         Args:

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import mujoco
@@ -244,18 +244,6 @@ def _aim(gl_camera: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # no
     gl_camera.frustum_near, gl_camera.frustum_far, gl_camera.orthographic = camera.near, camera.far, 0
 
 
-class MujocoState(NamedTuple):
-    """The joints, their loops, and MuJoCo's own state between steps; arrays never change."""
-
-    loops: DriveState  # angles and speeds of the joints with their loops
-    acceleration: FloatArray  # (n,) [rad/s²], from which the next solution of the constraints starts
-
-    @property
-    def angle(self) -> FloatArray:
-        """Joint angles θ, (n,) [rad]."""
-        return self.loops.angle
-
-
 class MujocoSimulation(Simulation):
     """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next.
 
@@ -285,23 +273,22 @@ class MujocoSimulation(Simulation):
         body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
         self._drives = Drives(drives, machine.lag, _assumed_inertia(machine), machine.stops, body)
 
-    def start(self, angle: FloatArray) -> MujocoState:
+    def start(self, angle: FloatArray) -> DriveState:
         """See `Simulation.start`."""
         data, rest = self._data, np.zeros(self._n)
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = angle, rest, rest
         data.qfrc_applied[:] = 0.0
         mujoco.mj_step1(self._model, data)
-        missing = data.qfrc_bias - data.qfrc_gravcomp
-        return MujocoState(DriveState(angle, rest, angle, rest, missing), rest)
+        return DriveState(angle, rest, angle, rest, data.qfrc_bias - data.qfrc_gravcomp, rest)
 
-    def advance(self, joints: MujocoState, speed: FloatArray, steps: int) -> MujocoState:
+    def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
         """See `Simulation.advance`."""
         drives, model, data = self._drives, self._model, self._data
-        drives.take(joints.loops, speed)
+        drives.take(joints, speed)
         if not self._dynamics:
             for _ in range(steps):
                 drives.track()
-            return MujocoState(drives.give(), joints.acceleration)
+            return drives.give()
         data.qacc_warmstart[:] = joints.acceleration
         torque, compensation, applied = drives.torque, data.qfrc_gravcomp, data.qfrc_applied
         for _ in range(steps):
@@ -309,7 +296,7 @@ class MujocoSimulation(Simulation):
             drives.step()
             np.subtract(torque, compensation, out=applied)  # MuJoCo adds the compensation itself
             mujoco.mj_step2(model, data)
-        return MujocoState(drives.give(), data.qacc_warmstart.copy())
+        return drives.give()._replace(acceleration=data.qacc_warmstart.copy())
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""
@@ -321,10 +308,7 @@ class MujocoSimulation(Simulation):
         for pair in data.contact.geom[data.contact.dist <= -MIN_OVERLAP].tolist():
             first, second = sorted(bodies[part] for part in pair)
             link = min(second - 1, self._n)  # MuJoCo counts the world as 0, the base as 1
-            if first == 0:
-                yield Overlap(link, self._boxes[min(pair)])
-            else:
-                yield Overlap(link, min(first - 1, self._n))
+            yield Overlap(link, self._boxes[min(pair)] if first == 0 else min(first - 1, self._n))
 
     def close(self) -> None:
         """See `Simulation.close`; MuJoCo frees its memory with the object."""
@@ -386,9 +370,8 @@ def read_urdf(text: str, meshes: Mapping[str, str] | None = None) -> Any:  # noq
         ValueError: MuJoCo cannot read it.
     """
     head, tag, rest = text.partition(">")
-    spec = mujoco.MjSpec.from_string(
-        f"{head}{tag}{KEEP_ALL}{rest}", assets={name: mesh.encode() for name, mesh in (meshes or {}).items()}
-    )
+    assets = {name: mesh.encode() for name, mesh in (meshes or {}).items()}
+    spec = mujoco.MjSpec.from_string(f"{head}{tag}{KEEP_ALL}{rest}", assets=assets)
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a flat one has no volume
     return spec

@@ -21,7 +21,7 @@ from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.detectors import open_detector
-from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.drives import PHYSICS_STEP, DriveState
 from servobench.plant.rendered.engine import Engine, Machine, Overlap
 from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import RenderedConfig
@@ -33,7 +33,10 @@ from servobench.plant.robot.ur5 import UR5
 
 CONTACT_STEPS = 10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
 LAST_ON_TABLE = 1  # base and shoulder stand on the table
-BUILT_INTO_EACH_OTHER = (0, 2)  # base and upper arm, whose housings meet inside the shoulder in every pose
+BUILT_INTO_EACH_OTHER: set[int | str] = {
+    0,
+    2,
+}  # base and upper arm, whose housings meet inside the shoulder in every pose
 
 
 class Contacts:
@@ -49,10 +52,9 @@ class Contacts:
         """
         self._overlaps = overlaps
         self._names = ["base", *arm.joint_names]
-        self._built_in = {BUILT_INTO_EACH_OTHER}
+        self._built_in = [BUILT_INTO_EACH_OTHER]
         if robot.name != UR5:
-            at_home = overlaps(arm.joint_angle(robot.workspace.home))
-            self._built_in |= {_pair(link, other) for link, other in at_home if isinstance(other, int)}
+            self._built_in += map(set, overlaps(arm.joint_angle(robot.workspace.home)))
 
     def find(self, angle: FloatArray, *, room: bool = True, own: bool = True) -> tuple[str, str] | None:
         """Return the names of two bodies that are in contact, or None.
@@ -66,23 +68,16 @@ class Contacts:
             if isinstance(other, str):
                 if room and link > LAST_ON_TABLE:
                     return self._names[link], other
-            elif own:
-                first, second = pair = _pair(link, other)
-                if second - first > 1 and pair not in self._built_in:
-                    return self._names[first], self._names[second]
+            elif own and abs(link - other) > 1 and {link, other} not in self._built_in:
+                return self._names[min(link, other)], self._names[max(link, other)]
         return None
-
-
-def _pair(link: int, other: int) -> tuple[int, int]:
-    """Return the numbers of two links in order."""
-    return min(link, other), max(link, other)
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedState:
     """A saved state of the world, without handles: any world with the same robot and settings can restore it."""
 
-    joints: Any  # angles, speeds and loops of the joints
+    joints: DriveState  # angles, speeds and loops of the joints
     periods: int  # number of periods since the reset
     camera: FloatArray  # (4, 4), pose of the first camera
     noise: Any  # of the detector
@@ -212,8 +207,7 @@ class RenderedWorld(World):
     def _joint_position(self) -> FloatArray:
         """Return the exact joint positions q = (θ − o)/g, (n,) rad."""
         arm = self._model.arm
-        q: FloatArray = (self._joints.angle - arm.joint_offset) / arm.gear_ratio
-        return q
+        return np.asarray((self._joints.angle - arm.joint_offset) / arm.gear_ratio)
 
     def _reported(self) -> FloatArray:
         """Return the joint positions in steps of the encoders, (n,) rad; the scale ends at the stops."""
