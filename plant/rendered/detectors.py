@@ -32,6 +32,7 @@ from scipy.ndimage import convolve1d
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate
 from servobench.plant.cameras.setups import SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import take
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import (
@@ -73,9 +74,7 @@ class Lens:
             optics: of all cameras of the set-up.
             camera: the number of this one.
         """
-        this = slice(camera, camera + 1)
-        further = None if optics.further is None else optics.further[this]
-        own = Optics(optics.focal[this], optics.centre[this], optics.distortion[this], optics.size, further)
+        own = take(optics, slice(camera, camera + 1))
         self._ideal = planned
         self._map: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None = None
         if as_planned(own, planned):
@@ -110,8 +109,7 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
     half = np.array([planned.width, planned.height]) / 2.0
     # The planned camera says where a pixel is sampled, counted from the upper left corner.
     pixels = half + planned.focal * planned.rays(columns.ravel(), rows.ravel())[:, :2]
-    rays: FloatArray = locate(pixels[None], np.ones((1, 1)), optics)[0]
-    return rays
+    return np.asarray(locate(pixels[None], np.ones((1, 1)), optics)[0])
 
 
 @final
@@ -431,5 +429,4 @@ def _patch_kernel(side: float) -> FloatArray:
     deviation = side / np.sqrt(12.0)
     reach = int(np.ceil(3.0 * deviation))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation, 1e-9)) ** 2)
-    kernel: FloatArray = weights / np.sqrt(weights @ weights)
-    return kernel
+    return np.asarray(weights / np.sqrt(weights @ weights))

@@ -78,41 +78,33 @@ class Room:
         Raises:
             ValueError: the arm has another number of joints than the robot.
         """
-        files = {**arm_files(self.arm, self.robot, self.rig), urdf.BALL_MESH: urdf.sphere_obj()}
+        files = {**self._own_files(), urdf.BALL_MESH: urdf.sphere_obj()}
         if self.scenery:
             files |= urdf.bench_files(self.robot.workspace.scale)
         if self.boxes:
             files["boxes.urdf"] = urdf.boxes_urdf(self.boxes)
         return files
 
-
-def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
-    """Return the files, text by name, of an arm with its target or cameras, `arm.urdf`, and of a target in the world.
-
-    Args:
-        arm: the kinematics, mismatch included.
-        robot: by its maker's description.
-        rig: of the set-up; None for the ball on the flange.
-    """
-    tree = urdf.arm_tree(arm, robot)
-    if rig is None:
-        return {"arm.urdf": urdf.text(tree)}
-    (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
-    for visual in carried.findall("visual"):
-        carried.remove(visual)
-    if rig.hand is None:
-        _draw_target(carried, rig, rig.target - arm.tool)
-        return {"arm.urdf": urdf.text(tree)}
-    radius, length = rig.scale * np.array(HOUSING)
-    for pose in rig.hand:
-        lens = pose[:3, 3] - arm.tool
-        urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
-    body = ET.Element("robot", name="target")
-    middle = rig.target.mean(axis=0)
-    urdf.add_link(body, "world", *urdf.BASE_PART)
-    _draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), rig, rig.target - middle)
-    urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
-    return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
+    def _own_files(self) -> dict[str, str]:
+        """Return the files of the arm with its target or cameras, and of a target in the world."""
+        tree, rig = urdf.arm_tree(self.arm, self.robot), self.rig
+        if rig is None:
+            return {"arm.urdf": urdf.text(tree)}
+        (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
+        for visual in carried.findall("visual"):
+            carried.remove(visual)
+        if rig.hand is None:
+            _draw_target(carried, rig, rig.target - self.arm.tool)
+            return {"arm.urdf": urdf.text(tree)}
+        radius, length = rig.scale * np.array(HOUSING)
+        for pose in rig.hand:
+            lens = pose[:3, 3] - self.arm.tool
+            urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
+        body, middle = ET.Element("robot", name="target"), rig.target.mean(axis=0)
+        urdf.add_link(body, "world", *urdf.BASE_PART)
+        _draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), rig, rig.target - middle)
+        urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
+        return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
 
 def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
@@ -151,11 +143,9 @@ class Overview:
             fineness: pixels for one pixel of `OVERVIEW_CAMERA`, along each side; above 1 edges become smooth once
                 scaled down.
         """
-        size = {"width": round(fineness * OVERVIEW_CAMERA.width), "height": round(fineness * OVERVIEW_CAMERA.height)}
-        return cls(
-            replace(OVERVIEW_CAMERA, **size),
-            _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET)),
-        )
+        width, height = (round(fineness * side) for side in (OVERVIEW_CAMERA.width, OVERVIEW_CAMERA.height))
+        pose = _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET))
+        return cls(replace(OVERVIEW_CAMERA, width=width, height=height), pose)
 
     def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""

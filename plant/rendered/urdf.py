@@ -205,15 +205,9 @@ def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool)
     return text(tree)
 
 
-def _table(scale: float) -> tuple[float, float, float, float]:
-    """Return x and y of two opposite corners of the table [m], which is as large as the workspace needs."""
-    x0, y0, x1, y1 = TABLE
-    return scale * x0, scale * y0, scale * x1, scale * y1
-
-
 def room_boxes(scale: float = 1.0) -> tuple[Box, Box]:
     """Return the table's top, `scale` times that of a UR5, and the floor as obstacles."""
-    x0, y0, x1, y1 = _table(scale)
+    x0, y0, x1, y1 = (scale * side for side in TABLE)
     table = (x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2
     return (
         Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)),
@@ -226,10 +220,10 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     robot = ET.Element("robot", name="boxes")
     body = add_link(robot, "boxes", *BASE_PART)
     for box in boxes:
-        shapes = [add_visual(body, DARK_GREY, box.centre, np.zeros(3))]
+        drawn = add_visual(body, DARK_GREY, box.centre, np.zeros(3))
         collision = ET.SubElement(body, "collision")
         ET.SubElement(collision, "origin", xyz=numbers(box.centre), rpy=numbers(np.zeros(3)))
-        for geometry in (*shapes, ET.SubElement(collision, "geometry")):
+        for geometry in (drawn, ET.SubElement(collision, "geometry")):
             ET.SubElement(geometry, "box", size=numbers(box.size))
     return text(robot)
 
@@ -253,7 +247,10 @@ def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    _draw_base(add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], radius[0])
+    base = add_link(robot, BASE_LINK, *BASE_PART)  # with a foot on the table and a stem up to the first joint
+    draw_cylinder(base, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius[0])
+    draw_cylinder(base, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius[0])
+    draw_cylinder(base, ALUMINIUM, (0.0, 0.0, 0.0), arm.translation[0], radius[0])
     for i, name in enumerate(arm.joint_names):
         step = arm.translation[i + 1]
         R = rotation_from_rpy(arm.rpy[i + 1])
@@ -282,7 +279,7 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
     """
     robot = ET.Element("robot", name="bench")
     bench = add_link(robot, "bench", *BASE_PART)
-    x0, y0, x1, y1 = _table(scale)
+    x0, y0, x1, y1 = (scale * side for side in TABLE)
     for x in (x0 + 0.04, x1 - 0.04):
         for y in (y0 + 0.04, y1 - 0.04):
             draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
@@ -305,23 +302,16 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
     return files | {"bench.urdf": text(robot)}
 
 
-def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
-    """Draw the foot on the table and the stem up to the first joint."""
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius)
-    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius)
-    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.0), step, radius)
-
-
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
     """Draw a link: a capped housing about its joint, a tube beside it, and the connection to the next joint."""
-    top, corner, end = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side]), step
+    top, corner = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side])
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
     outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
     draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
     draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
     draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
-    draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
+    draw_cylinder(link, DARK_GREY, corner, step, 0.95 * radius)
     if far_aside:
         draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
         draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
