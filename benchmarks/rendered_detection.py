@@ -22,7 +22,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.bullet import BulletScene
 from servobench.plant.rendered.detectors import open_detector
-from servobench.plant.rendered.room import Rig, Room
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -44,7 +44,7 @@ def true_model(word: str, seed: int) -> SetupModel:
 def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, float]:
     """Return true and found pixels (poses, c, p, 2), NaN where a mark is not found, and the time of a look [ms]."""
     model, rng = true_model(word, seed), np.random.default_rng(seed)
-    scene = BulletScene(Room(model.arm, NOISELESS.scenery, robot=ROBOT, rig=Rig.of(model, ROBOT)))
+    scene = BulletScene(Room(model.arm, NOISELESS.scenery, robot=ROBOT, model=model))
     detector, work, took = open_detector(model, scene, NOISELESS, ROBOT), ROBOT.workspace, 0.0
     detector.reset(seed)
     true, found = [], []

@@ -32,37 +32,6 @@ OVERVIEW_CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
-    """Positions of the target and the cameras of a set-up."""
-
-    target: FloatArray  # (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame
-    # (c, 4, 4), poses of the cameras in the flange frame; None where they are beside the arm and not drawn
-    hand: FloatArray | None
-    scale: float  # of all lengths, over those of a UR5's bench
-    ball_radius: float  # [m]
-
-    @classmethod
-    def of(cls, model: SetupModel, robot: Robot) -> Self | None:
-        """Return the rig of a set-up; None where it is the ball on the flange, which every arm carries.
-
-        Raises:
-            ValueError: a target that cannot be drawn.
-        """
-        on_hand = model.mount == "hand"
-        count = len(model.target)
-        if count == 1 and not on_hand:
-            return None
-        if count > len(MARK_COLOURS) or (count > 1 and not np.any(_normal(model.target))):
-            raise ValueError(
-                f"sensing {model.setup.name} has a target of {count} points; only these can be drawn: a ball, of one "
-                "point, or a plate with three or four discs that are not in line"
-            )
-        work, side = robot.workspace, None if robot.camera is None else robot.camera.keys.target.side
-        scale = work.scale if side is None or count == 1 else side / (2.0 * HALF)
-        return cls(model.target, model.cameras if on_hand else None, scale, work.ball_radius)
-
-
-@dataclass(frozen=True, eq=False)
 class Room:
     """An arm and the bodies around it; the base frame is the world frame."""
 
@@ -70,13 +39,13 @@ class Room:
     scenery: bool  # whether the table and the floor are there
     robot: Robot  # by its maker's description, for the visual shapes
     boxes: tuple[Box, ...] = ()  # obstacles
-    rig: Rig | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
+    model: SetupModel | None = None  # target and cameras of a sensing set-up; None for the ball on the flange
 
     def files(self) -> dict[str, str]:
         """Return the files, text by name: a URDF for each body, that of the arm first, and the meshes they name.
 
         Raises:
-            ValueError: the arm has another number of joints than the robot.
+            ValueError: the arm has another number of joints than the robot, or a target that cannot be drawn.
         """
         files = {**self._own_files(), urdf.BALL_MESH: urdf.sphere_obj()}
         if self.scenery:
@@ -87,37 +56,47 @@ class Room:
 
     def _own_files(self) -> dict[str, str]:
         """Return the files of the arm with its target or cameras, and of a target in the world."""
-        tree, rig = urdf.arm_tree(self.arm, self.robot), self.rig
-        if rig is None:
+        tree, model = urdf.arm_tree(self.arm, self.robot), self.model
+        if model is None or (model.mount == "fixed" and len(model.target) == 1):  # the ball, which every arm carries
             return {"arm.urdf": urdf.text(tree)}
         (carried,) = (link for link in tree.iter("link") if link.get("name") == urdf.BALL_LINK)
         for visual in carried.findall("visual"):
             carried.remove(visual)
-        if rig.hand is None:
-            _draw_target(carried, rig, rig.target - self.arm.tool)
+        if model.mount == "fixed":
+            self._draw_target(carried, model, -self.arm.tool)
             return {"arm.urdf": urdf.text(tree)}
-        radius, length = rig.scale * np.array(HOUSING)
-        for pose in rig.hand:
+        radius, length = self._scale(model) * np.array(HOUSING)
+        for pose in model.cameras:
             lens = pose[:3, 3] - self.arm.tool
             urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
-        body, middle = ET.Element("robot", name="target"), rig.target.mean(axis=0)
+        body, middle = ET.Element("robot", name="target"), model.target.mean(axis=0)
         urdf.add_link(body, "world", *urdf.BASE_PART)
-        _draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), rig, rig.target - middle)
+        self._draw_target(urdf.add_link(body, "target", *urdf.BASE_PART), model, -middle)
         urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
         return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
+    def _scale(self, model: SetupModel) -> float:
+        """Return the scale of all lengths of a target and its cameras, over those of a UR5's bench."""
+        side = None if self.robot.camera is None else self.robot.camera.keys.target.side
+        return self.robot.workspace.scale if side is None or len(model.target) == 1 else side / (2.0 * HALF)
 
-def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
-    """Draw ball or plate at points (p, 3) [m] of a link's frame."""
-    if len(points) == 1:
-        urdf.draw_mesh(link, RED, urdf.BALL_MESH, rig.ball_radius)
-        return
-    scale = rig.scale
-    back, middle = LAYER * scale * _normal(points), points.mean(axis=0)
-    for point, colour in zip(points, MARK_COLOURS, strict=False):
-        urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
-        urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
-        urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+    def _draw_target(self, link: ET.Element, model: SetupModel, shift: FloatArray) -> None:
+        """Draw ball or plate, the points of which are shifted by (3,) [m] into a link's frame."""
+        points, scale = model.target + shift, self._scale(model)
+        if len(points) == 1:
+            urdf.draw_mesh(link, RED, urdf.BALL_MESH, self.robot.workspace.ball_radius)
+            return
+        normal = _normal(points)
+        if len(points) > len(MARK_COLOURS) or not normal.any():
+            raise ValueError(
+                f"sensing {model.setup.name} has a target of {len(points)} points; only these can be drawn: a ball, of "
+                "one point, or a plate with three or four discs that are not in line"
+            )
+        back, middle = LAYER * scale * normal, points.mean(axis=0)
+        for point, colour in zip(points, MARK_COLOURS, strict=False):
+            urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
+            urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
+            urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
 
 
 def _normal(points: FloatArray) -> FloatArray:

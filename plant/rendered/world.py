@@ -23,7 +23,7 @@ from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.detectors import open_detector
 from servobench.plant.rendered.drives import PHYSICS_STEP, DriveState
 from servobench.plant.rendered.engine import Engine, Machine, Overlap
-from servobench.plant.rendered.room import Rig, Room
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot
@@ -42,33 +42,31 @@ BUILT_INTO_EACH_OTHER: set[int | str] = {
 class Contacts:
     """The contact of one arm; neighbouring links never count, nor do base and shoulder on their table."""
 
-    def __init__(self, overlaps: Callable[[FloatArray], Iterable[Overlap]], arm: SerialArm, robot: Robot) -> None:
+    def __init__(
+        self, overlaps: Callable[[FloatArray], Iterable[Overlap]], arm: SerialArm, robot: Robot, config: RenderedConfig
+    ) -> None:
         """Find the links that are built into each other.
 
         Args:
             overlaps: from joint angles (n,) [rad] to the bodies that overlap.
             arm: the true kinematics.
             robot: by its maker's description; its home is free of contact.
+            config: whether contact counts.
         """
+        self._room, self._own = config.room_contact, config.self_contact
         self._overlaps = overlaps
         self._names = ["base", *arm.joint_names]
         self._built_in = [BUILT_INTO_EACH_OTHER]
         if robot.name != UR5:
             self._built_in += map(set, overlaps(arm.joint_angle(robot.workspace.home)))
 
-    def find(self, angle: FloatArray, *, room: bool = True, own: bool = True) -> tuple[str, str] | None:
-        """Return the names of two bodies that are in contact, or None.
-
-        Args:
-            angle: (n,) [rad], joint angles.
-            room: whether contact with table, floor and boxes counts.
-            own: whether contact of the arm with itself counts.
-        """
-        for link, other in self._overlaps(angle):
+    def find(self, angle: FloatArray) -> tuple[str, str] | None:
+        """Return the names of two bodies whose contact counts at joint angles (n,) [rad], or None."""
+        for link, other in self._overlaps(angle) if self._room or self._own else ():
             if isinstance(other, str):
-                if room and link > LAST_ON_TABLE:
+                if self._room and link > LAST_ON_TABLE:
                     return self._names[link], other
-            elif own and abs(link - other) > 1 and {link, other} not in self._built_in:
+            elif self._own and abs(link - other) > 1 and {link, other} not in self._built_in:
                 return self._names[min(link, other)], self._names[max(link, other)]
         return None
 
@@ -107,8 +105,8 @@ class RenderedWorld(World):
         self._camera = model.camera
         self._valid: BoolArray | None = None
         boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
-        rig = Rig.of(model, robot) if isinstance(model, SetupModel) else None
-        self._scene = engine.scene(Room(arm, config.scenery, robot, boxes, rig), window=config.view)
+        room = Room(arm, config.scenery, robot, boxes, model if isinstance(model, SetupModel) else None)
+        self._scene = engine.scene(room, window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)
@@ -118,7 +116,7 @@ class RenderedWorld(World):
         except BaseException:
             self._scene.close()
             raise
-        self._contacts = Contacts(self._simulation.overlaps, arm, robot)
+        self._contacts = Contacts(self._simulation.overlaps, arm, robot, config)
 
     def reset(self, seed: int) -> FloatArray:
         """Go back to the start at rest. See `World.reset`.
@@ -157,8 +155,7 @@ class RenderedWorld(World):
         return self._reported()
 
     def _check_contact(self, step: int) -> None:
-        room, own = self._config.room_contact, self._config.self_contact
-        touching = self._contacts.find(self._joints.angle, room=room, own=own) if room or own else None
+        touching = self._contacts.find(self._joints.angle)
         if touching is not None:
             seconds = self._periods * self.spec.period + step * PHYSICS_STEP
             raise Collision(f"{touching[0]} meets {touching[1]} at {seconds:.3f} s")

@@ -13,7 +13,7 @@ from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.detectors import open_detector
-from servobench.plant.rendered.room import Rig, Room
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -46,7 +46,7 @@ def open_setup(engine):
 @pytest.mark.parametrize("word", IN_PIXELS)
 def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word, engine):
     model, rng = true_model(word), np.random.default_rng(5)
-    scene = scene_of(engine)(Room(model.arm, scenery=False, robot=UR5, rig=Rig.of(model, UR5)))
+    scene = scene_of(engine)(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
     detector.reset(0)
     while poses < 8:
