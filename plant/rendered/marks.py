@@ -65,11 +65,13 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | N
     """
     hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
     masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
+    grown = [cv2.dilate(mask, NEIGHBOURS) for mask in masks]
     found: list[Mark | None] = []
     for number, mask in enumerate(masks):
-        patch, others = largest_patch(mask), masks[:number] + masks[number + 1 :]
+        patch, others = largest_patch(mask), grown[:number] + grown[number + 1 :]
         whole = patch if patch is None or others or fills_ellipse(patch) else _hull(patch)
-        if patch is None or whole is None or not fills_ellipse(whole) or _touches(patch, others):
+        touched = patch is not None and any(other[patch.rows, patch.columns].any() for other in others)
+        if patch is None or whole is None or touched or not fills_ellipse(whole):
             found.append(None)
         else:
             found.append(_with_shares(patch, whole, rgb, colours[number].paint))
@@ -135,13 +137,3 @@ def _in_image(direction: FloatArray, camera: PinholeCamera) -> FloatArray:
     """Return where a direction (3,) appears, (2,) px."""
     half = np.array([camera.width, camera.height]) / 2.0
     return np.asarray(half + camera.focal * direction[:2] / direction[2])
-
-
-def _touches(patch: Patch, others: list[ByteArray]) -> bool:
-    """Return whether a neighbour of a pixel of a patch, which the border does not cut, belongs to another mark."""
-    return any(
-        other[patch.rows + down, patch.columns + right].any()
-        for other in others
-        for down in (-1, 0, 1)
-        for right in (-1, 0, 1)
-    )

@@ -75,20 +75,13 @@ def universal_robot(title: str) -> Robot:
 
 def _ur5() -> Robot:
     """Return the UR5, with the workspace of its sheet."""
-    links = Links(
-        np.array(ur5.MASS), np.array(ur5.CENTRE_OF_MASS), np.array(ur5.INERTIA), np.array(ur5.MAX_TORQUE),
-        np.array(ur5.TUBE_RADIUS), np.array(ur5.SIDE_STEP), UNIVERSAL_ROBOTS["UR5"].payload,
-    )  # fmt: skip
-    workspace = Workspace(
-        scale=1.0,
-        centre=np.array(CENTRE),
-        shoulder=np.array(ur5.SHOULDER),
-        home=np.array(ur5.HOME),
-        lower=np.array(ur5.TRAINING_LOWER),
-        upper=np.array(ur5.TRAINING_UPPER),
-        moves={name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()},
-        stretched=np.array(ur5.STRETCHED),
-    )
+    bodies = ur5.MASS, ur5.CENTRE_OF_MASS, ur5.INERTIA, ur5.MAX_TORQUE, ur5.TUBE_RADIUS, ur5.SIDE_STEP
+    mass, middle, inertia, torque, radius, aside = map(np.array, bodies)
+    links = Links(mass, middle, inertia, torque, radius, aside, UNIVERSAL_ROBOTS["UR5"].payload)
+    places = CENTRE, ur5.SHOULDER, ur5.HOME, ur5.TRAINING_LOWER, ur5.TRAINING_UPPER, ur5.STRETCHED
+    centre, shoulder, home, lower, upper, stretched = map(np.array, places)
+    moves = {name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()}
+    workspace = Workspace(1.0, centre, shoulder, home, lower, upper, moves, stretched)
     limits = _ur_limits(UNIVERSAL_ROBOTS["UR5"])
     return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
