@@ -11,7 +11,6 @@ where that slope grows without bound, and pixels whose residual stands far off t
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -155,30 +154,19 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     return fit if plausible and complete else None
 
 
-def find_ball(
-    rgb: ByteArray,
-    buffer: FloatArray,
-    camera: PinholeCamera,
-    radius: float,
-    sense: Callable[[FloatArray, Patch], FloatArray] | None = None,
-    corner: tuple[int, int] = (0, 0),
-) -> Detection | None:
-    """Return the ball in a rendered image, or in a part of one around it, or None where none is found.
+def find_ball(rgb: ByteArray, buffer: FloatArray, camera: PinholeCamera, radius: float) -> Detection | None:
+    """Return the ball in a rendered image without noise, or None where none is found.
 
     Args:
         rgb: (h, w, 3 or 4).
         buffer: depth buffer, (h, w).
         camera: its intrinsics.
         radius: m, of the ball.
-        sense: true to measured depths of a patch, (k,) m each; None for a perfect sensor.
-        corner: row and column [px] of the first pixel; a part touches the ball only where the image ends, too.
     """
     patch = find_patch(rgb)
     if patch is None:
         return None
-    depth = camera.metric_depth(buffer[patch.rows, patch.columns])
-    patch = Patch(patch.rows + corner[0], patch.columns + corner[1])
-    return locate_ball(patch, depth if sense is None else sense(depth, patch), camera, radius)
+    return locate_ball(patch, camera.metric_depth(buffer[patch.rows, patch.columns]), camera, radius)
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:

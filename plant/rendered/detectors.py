@@ -43,6 +43,8 @@ from servobench.plant.rendered.detection import (
     add_colour_noise,
     draw_detection,
     find_ball,
+    find_patch,
+    locate_ball,
     window_around,
 )
 from servobench.plant.rendered.engine import Scene
@@ -138,11 +140,14 @@ class DepthCamera:
         rgba, buffer = self._scene.render(self.camera, X_BC, window)
         if self._deviation > 0.0:
             rgba = add_colour_noise(rgba, self._deviation, noise[COLOUR])
-
-        def with_noise(depth: FloatArray, patch: Patch) -> FloatArray:
-            return measure_depth(self._config, depth, patch, self.camera, noise[DEPTH])
-
-        return find_ball(rgba, buffer, self.camera, self.radius, with_noise, (window.top, window.left))
+        patch = find_patch(rgba)
+        if patch is None:
+            return None
+        depth = self.camera.metric_depth(buffer[patch.rows, patch.columns])
+        measured = measure_depth(self._config, depth, patch, self.camera, noise[DEPTH])
+        # A patch touches the border of the window only where the image ends, too.
+        patch = Patch(patch.rows + window.top, patch.columns + window.left)
+        return locate_ball(patch, measured, self.camera, self.radius)
 
     def picture(self, X_BC: FloatArray) -> ByteArray:
         """Return the image from X_BC (4, 4) without noise, with the detected ball marked, (h, w, 3)."""
