@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.detection import ByteArray, Window
+from servobench.plant.rendered.detection import Window
 from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
-from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Image, Machine, Overlap, Scene, Simulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import arm_mechanics, boxes_urdf, room_boxes
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
@@ -146,9 +146,7 @@ class BulletScene(Scene):
         state = pybullet.getLinkState(self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=client)
         return np.array(state[4])
 
-    def render(
-        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
-    ) -> tuple[ByteArray, FloatArray]:
+    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
         """See `Scene.render`; TinyRenderer knows no window, so that all is rendered."""
         _, _, rgba, depth, _ = pybullet.getCameraImage(
             camera.width,

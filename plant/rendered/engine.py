@@ -17,6 +17,7 @@ from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
 
+Image = tuple[ByteArray, FloatArray]  # colours and depths
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
 
@@ -44,9 +45,7 @@ class Scene(ABC):
         """Return the ball's centre in the base frame, (3,) m, from the engine's own kinematics."""
 
     @abstractmethod
-    def render(
-        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
-    ) -> tuple[ByteArray, FloatArray]:
+    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
         """Return the image of a camera at X_BC (4, 4): colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
 
         With a window only this part of the image, the same pixels as in all of it.

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
-from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Image, Machine, Overlap, Scene, Simulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
@@ -160,9 +160,7 @@ class MujocoScene(Scene):
         """See `Scene.ball_position`."""
         return np.array(self._data.xpos[self._ball])
 
-    def render(
-        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
-    ) -> tuple[ByteArray, FloatArray]:
+    def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
         """See `Scene.render`."""
         rgb, depth = self.draw(camera, X_BC, window or whole(camera))
         # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
@@ -177,9 +175,8 @@ class MujocoScene(Scene):
         Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.
         """
         self._leave_out(camera, X_BC, window)
-        mujoco.mjv_updateScene(
-            self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
-        )
+        kinds = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, self._data, self._options, None, self._view, kinds, self._drawn)
         for gl_camera in self._drawn.camera:
             _aim(gl_camera, camera, X_BC)
         shape, context = (window.bottom - window.top, window.right - window.left), self._context
