@@ -88,10 +88,9 @@ class Room:
             return
         normal = _normal(points)
         if len(points) > len(MARK_COLOURS) or not normal.any():
-            raise ValueError(
-                f"sensing {model.setup.name} has a target of {len(points)} points; only these can be drawn: a ball, of "
-                "one point, or a plate with three or four discs that are not in line"
-            )
+            wanted = "a ball, of one point, or a plate with three or four discs that are not in line"
+            came = f"sensing {model.setup.name} has a target of {len(points)} points"
+            raise ValueError(f"{came}; only these can be drawn: {wanted}")
         back, middle = LAYER * scale * normal, points.mean(axis=0)
         for point, colour in zip(points, MARK_COLOURS, strict=False):
             urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)

@@ -136,9 +136,8 @@ class RenderedConfig:
 
     def boxes(self) -> tuple[Box, ...]:
         """Return the obstacles."""
-        return tuple(
-            Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in enumerate(self.obstacles, 1)
-        )
+        boxes = enumerate(self.obstacles, 1)
+        return tuple(Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in boxes)
 
 
 def rendered_config(robot: Robot) -> RenderedConfig:

@@ -209,10 +209,8 @@ def room_boxes(scale: float = 1.0) -> tuple[Box, Box]:
     """Return the table's top, `scale` times that of a UR5, and the floor as obstacles."""
     x0, y0, x1, y1 = (scale * side for side in TABLE)
     table = (x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2
-    return (
-        Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)),
-        Box("floor", (0.0, 0.0, -FLOOR_DROP - 0.5), (10.0, 10.0, 1.0)),
-    )
+    floor = Box("floor", (0.0, 0.0, -FLOOR_DROP - 0.5), (10.0, 10.0, 1.0))
+    return Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)), floor
 
 
 def boxes_urdf(boxes: tuple[Box, ...]) -> str:

@@ -200,10 +200,8 @@ class JointLimits:
         for name in ("lower", "upper", "speed"):
             object.__setattr__(self, name, as_vector(name, getattr(self, name), len(self.lower)))
         if not (self.lower < self.upper).all():
-            raise ValueError(
-                "joint_lower must be below joint_upper for every joint, "
-                f"got {self.lower.tolist()} and {self.upper.tolist()}"
-            )
+            came = f"{self.lower.tolist()} and {self.upper.tolist()}"
+            raise ValueError(f"joint_lower must be below joint_upper for every joint, got {came}")
         if not (self.speed > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {self.speed.tolist()}")
 

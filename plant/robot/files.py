@@ -56,21 +56,14 @@ def read_calibrated_robot(path: Path) -> Robot:
     """
     title, deviation = nearest_title(read_calibration(path, np.zeros(3)))
     if deviation > MAX_DEVIATION:
-        raise ValueError(
-            f"calibration file {path} fits no arm of Universal Robots: the {title} comes nearest, and its flange is "
-            f"{1e3 * deviation:.0f} mm away"
-        )
+        nearest = f"the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away"
+        raise ValueError(f"calibration file {path} fits no arm of Universal Robots: {nearest}")
     sheet = universal_robot(title)
-    return replace(
-        sheet,
-        name=path.stem,
-        source=f"{path.name}, held against {sheet.source}",
-        measured=read_calibration(path, sheet.arm.tool),
-        note=(
-            f"{path.name} is the factory calibration of a {title} (its flange within {1e3 * deviation:.1f} mm of the "
-            f"data sheet's): the true robot is the calibrated arm, controllers know the data sheet's {title}"
-        ),
-    )
+    source, measured = f"{path.name}, held against {sheet.source}", read_calibration(path, sheet.arm.tool)
+    within = f"its flange within {1e3 * deviation:.1f} mm of the data sheet's"
+    roles = f"the true robot is the calibrated arm, controllers know the data sheet's {title}"
+    note = f"{path.name} is the factory calibration of a {title} ({within}): {roles}"
+    return replace(sheet, name=path.stem, source=source, measured=measured, note=note)
 
 
 Lengths = tuple[Annotated[Number, Ge(-20.0), Le(20.0), Usual(5.0)], ...]

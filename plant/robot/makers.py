@@ -65,10 +65,8 @@ def universal_robot(title: str) -> Robot:
     scale = length_scale(arm)
     radius, aside = scale * np.array(ur5.TUBE_RADIUS), scale * np.array(ur5.SIDE_STEP)
     mass = np.array(row.mass)
-    links = Links(
-        mass, np.array(row.centre), cylinder_inertia(mass, radius, arm), _by_joint(row.torque), radius, aside,
-        row.payload,
-    )  # fmt: skip
+    inertia, torque = cylinder_inertia(mass, radius, arm), _by_joint(row.torque)
+    links = Links(mass, np.array(row.centre), inertia, torque, radius, aside, row.payload)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
 
@@ -125,22 +123,16 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
     if file is None and robot.measured is not None:
         return robot.measured
     if robot.title not in UNIVERSAL_ROBOTS:
-        raise ValueError(
-            f"mismatch 'factory' needs a calibration file of Universal Robots, which a {robot.title} does not have; "
-            "use the axes links and joint_offsets"
-        )
+        wanted = f"a calibration file of Universal Robots, which a {robot.title} does not have"
+        raise ValueError(f"mismatch 'factory' needs {wanted}; use the axes links and joint_offsets")
     if file is None and robot.title != "UR5":
-        raise ValueError(
-            f"mismatch 'factory' without a file is the calibration of one real UR5, and the robot is a {robot.title}; "
-            "use factory=FILE with its own"
-        )
+        other = f"the calibration of one real UR5, and the robot is a {robot.title}"
+        raise ValueError(f"mismatch 'factory' without a file is {other}; use factory=FILE with its own")
     arm = read_calibration(None if file is None else user_path(file), robot.arm.tool)
     title, deviation = nearest_title(arm)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
-        raise ValueError(
-            f"calibration file {file} is that of a {title} (lengths within {1e3 * deviation:.1f} mm), and the robot is "
-            f"a {robot.title}; use --robot {title.lower()}, or --robot {file}"
-        )
+        other = f"that of a {title} (lengths within {1e3 * deviation:.1f} mm), and the robot is a {robot.title}"
+        raise ValueError(f"calibration file {file} is {other}; use --robot {title.lower()}, or --robot {file}")
     return arm
 
 

@@ -54,10 +54,8 @@ def _unknown_word(text: str, word: str) -> ValueError:
     near = nearest(name, [*PROFILES, *AXES])
     hint = f"did you mean {near!r}? " if near else ""
     examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
-    return ValueError(
-        f"mismatch {text!r}: {word!r} is not known here; {hint}wanted one profile ({', '.join(PROFILES)}, "
-        f"factory=FILE) and then axes such as {examples}, joined by '+'"
-    )
+    wanted = f"one profile ({', '.join(PROFILES)}, factory=FILE) and then axes such as {examples}, joined by '+'"
+    return ValueError(f"mismatch {text!r}: {word!r} is not known here; {hint}wanted {wanted}")
 
 
 @dataclass(frozen=True)

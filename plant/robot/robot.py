@@ -105,6 +105,7 @@ TAPER: Final = 0.65  # radius of the last tube over that of the first
 TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
 LEAST_TORQUE: Final = 5.0  # [Nm]
 GRAVITY: Final = 9.81  # [m/s²]
+Bodies = tuple[FloatArray, FloatArray]  # centres of mass (n, 3) [m] and inertia (n, 3, 3) [kg m²] of links
 PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
@@ -119,7 +120,7 @@ def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> Fl
     return np.stack([mass * (3.0 * radius**2 + length**2) / 12.0, mass * radius**2 / 2.0], axis=-1)
 
 
-def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
+def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> Bodies:
     """Return centres of mass (n, 3) m and inertia (n, 3, 3) kg m², given in joint frames, in the frames of `Links`."""
     R = rotation_from_rpy(arm.rpy[1:])
     turned = np.swapaxes(R, -1, -2)
@@ -127,10 +128,7 @@ def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> tuple
 
 
 def estimate_links(
-    arm: SerialArm,
-    mass: FloatArray | None = None,
-    torque: FloatArray | None = None,
-    bodies: tuple[FloatArray, FloatArray] | None = None,
+    arm: SerialArm, mass: FloatArray | None = None, torque: FloatArray | None = None, bodies: Bodies | None = None
 ) -> Links:
     """Return links with their known values, and estimates in place of the rest.
 

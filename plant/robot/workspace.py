@@ -32,7 +32,7 @@ REACH: Final = (0.35, 0.75)  # [m] from a UR5's shoulder to the ball: away from 
 R_BC_DOWN: Final = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 Clear = Callable[[FloatArray], BoolArray]
-Move = tuple[FloatArray, FloatArray]  # start and target, (n,) and (n,) [rad]
+Pair = tuple[FloatArray, FloatArray]  # (n,) and (n,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Workspace:
     home: FloatArray  # (n,) [rad], the start of most runs
     lower: FloatArray  # (n,) [rad], lower corner of the box in which networks are trained and random moves are drawn
     upper: FloatArray  # (n,) [rad]
-    moves: Mapping[str, Move]  # start and target of the moves by name
+    moves: Mapping[str, Pair]  # start and target [rad] of the moves by name
     stretched: FloatArray  # (n,) [rad], a start at which the Jacobian is nearly singular
     # returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None where
     # all of the box is.
@@ -239,9 +239,7 @@ def with_ball(arm: SerialArm) -> SerialArm:
     return replace(arm, tool=np.array([0.0, 0.0, TOOL * length_scale(arm)]))
 
 
-def find_workspace(
-    arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray]
-) -> Workspace:
+def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     """Return the workspace of an arm.
 
     Args:
@@ -264,16 +262,12 @@ def find_workspace(
         look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
         if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
             look = "its joint limits, which forbid all of them"
-        raise ValueError(
-            "the arm has no posture in which its ball is over the table, in view of the camera and free of contact; "
-            f"look at {look}"
-        )
+        wanted = "in which its ball is over the table, in view of the camera and free of contact"
+        raise ValueError(f"the arm has no posture {wanted}; look at {look}")
     return max(fit, key=lambda each: each[0])[1]
 
 
-def _at_height(
-    arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray], height: float
-) -> tuple[float, Workspace] | None:
+def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> tuple[float, Workspace] | None:
     """Return the workspace at a height and the fit share of its box; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
@@ -307,7 +301,7 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     return np.asarray(fit[order[int(np.argmax(shares))]])
 
 
-def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
+def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, Pair]:
     """Return the largest box around a home with enough fit postures, and their share."""
     half = np.full(clear.arm.n, HALF_BOX)
     half[-1] = LAST_HALF
@@ -322,7 +316,7 @@ def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArr
     return best
 
 
-def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatArray) -> Move:
+def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatArray) -> Pair:
     """Return a move of the ball from a `start` to a `target`, (3,) m, on which the arm stays fit all the way.
 
     The way is that of a servo that knows the arm: the ball goes straight, the joints by the pseudo-inverse. A move
