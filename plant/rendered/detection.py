@@ -297,9 +297,8 @@ def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> W
     if z <= radius + camera.near:
         return None if z < -radius else whole(camera)
     depth2 = z * z - radius * radius
-    ends = [
-        [(at * z + side * radius * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0] for side in (-1, 1)
-    ]
+    sides = -radius, radius
+    ends = [[(at * z + side * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0] for side in sides]
     (left, top), (right, bottom) = camera.project(ends).tolist()
     window = Window(
         max(0, math.floor(top) - MARGIN),

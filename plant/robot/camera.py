@@ -17,8 +17,6 @@ from servobench.plant.contract.settings import Count, Positive, settings
 
 PIXEL_CENTRE = (0.0, 1.0)  # [px] sampling point of TinyRenderer, from the pixel's upper left corner
 IntArray: TypeAlias = npt.NDArray[np.intp]
-FieldOfView: TypeAlias = Annotated[float, Gt(0.0), Lt(180.0)]
-"""Above 0° and below 180°."""
 
 
 @settings
@@ -29,7 +27,7 @@ class PinholeCamera:
     """[px]"""
     height: Count = 240
     """[px]"""
-    vertical_fov: FieldOfView = 60.0
+    vertical_fov: Annotated[float, Gt(0.0), Lt(180.0)] = 60.0
     """[deg] it covers the workspace with a margin from 1.3 m."""
     near: Positive = 0.1
     """[m] clipping plane."""

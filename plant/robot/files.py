@@ -128,9 +128,8 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
 def _robot_of(table: DhTable, path: Path) -> Robot:
     arm = with_ball(_arm_of(table))
     n = arm.n
-    limits = JointLimits(
-        *(as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
-    )
+    given = (as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
+    limits = JointLimits(*given)
     mass, torque = (as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque"))
     links = estimate_links(arm, mass, torque)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))

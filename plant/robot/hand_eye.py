@@ -149,9 +149,7 @@ class HandEyeModel(RobotModel):
     """A serial arm under a fixed camera, eye to hand."""
 
     arm: SerialArm  # the arm with the ball on its flange
-    # (..., 4, 4), camera in the base frame, with the leading axes of the arm's arrays; z along the optical axis, x
-    # right and y down in the image.
-    X_BC: FloatArray
+    X_BC: FloatArray  # (..., 4, 4), camera in the base frame; z along the optical axis, x right and y down in the image
 
     def __post_init__(self) -> None:
         """Check that the camera pose is a rigid transform and freeze it."""

@@ -11,6 +11,7 @@ Automation Letters 4 (2019). Radii of tubes are appearance.
 from dataclasses import dataclass
 from functools import cache
 from math import pi
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
@@ -58,9 +59,9 @@ UNIVERSAL_ROBOTS: Final = {title: UniversalRobot(**row) for title, row in ur5.AR
 @cache
 def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
-    if title == "UR5":
-        return _ur5()
     row = UNIVERSAL_ROBOTS[title]
+    if title == "UR5":
+        return _ur5(row)
     arm, limits = with_ball(row.arm()), _ur_limits(row)
     scale = length_scale(arm)
     radius, aside = scale * np.array(ur5.TUBE_RADIUS), scale * np.array(ur5.SIDE_STEP)
@@ -71,22 +72,20 @@ def universal_robot(title: str) -> Robot:
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
 
 
-def _ur5() -> Robot:
+def _ur5(row: UniversalRobot) -> Robot:
     """Return the UR5, with the workspace of its sheet."""
     bodies = ur5.MASS, ur5.CENTRE_OF_MASS, ur5.INERTIA, ur5.MAX_TORQUE, ur5.TUBE_RADIUS, ur5.SIDE_STEP
     mass, middle, inertia, torque, radius, aside = map(np.array, bodies)
-    links = Links(mass, middle, inertia, torque, radius, aside, UNIVERSAL_ROBOTS["UR5"].payload)
+    links = Links(mass, middle, inertia, torque, radius, aside, row.payload)
     places = CENTRE, ur5.SHOULDER, ur5.HOME, ur5.TRAINING_LOWER, ur5.TRAINING_UPPER, ur5.STRETCHED
     centre, shoulder, home, lower, upper, stretched = map(np.array, places)
     moves = {name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()}
     workspace = Workspace(1.0, centre, shoulder, home, lower, upper, moves, stretched)
-    limits = _ur_limits(UNIVERSAL_ROBOTS["UR5"])
-    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
+    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), _ur_limits(row), links, workspace)
 
 
 def _by_joint(values: Triple) -> FloatArray:
-    shoulder, elbow, wrist = values
-    return np.array([shoulder, shoulder, elbow, wrist, wrist, wrist])
+    return np.repeat(values, (2, 1, 3))
 
 
 def _ur_limits(row: UniversalRobot) -> JointLimits:
@@ -175,9 +174,8 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:
     """Return the title of the arm of Universal Robots that is nearest to a calibrated one, and its deviation [m]."""
-    deviations = {title: deviation_from(arm, title) for title in UNIVERSAL_ROBOTS}
-    title = min(deviations, key=lambda each: deviations[each])
-    return title, deviations[title]
+    deviations = ((title, deviation_from(arm, title)) for title in UNIVERSAL_ROBOTS)
+    return min(deviations, key=itemgetter(1))
 
 
 def deviation_from(arm: SerialArm, title: str) -> float:

@@ -109,14 +109,9 @@ Bodies = tuple[FloatArray, FloatArray]  # centres of mass (n, 3) [m] and inertia
 PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
-def link_lengths(arm: SerialArm) -> FloatArray:
-    """Return the distance of each joint from the next one, or the flange, (n,) m."""
-    return norm(arm.translation[1:])
-
-
 def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> FloatArray:
     """Return the inertia of links as solid cylinders, across and along them, (n, 2) kg m²."""
-    length = link_lengths(arm) + 2.0 * radius
+    length = norm(arm.translation[1:]) + 2.0 * radius
     return np.stack([mass * (3.0 * radius**2 + length**2) / 12.0, mass * radius**2 / 2.0], axis=-1)
 
 
@@ -138,7 +133,7 @@ def estimate_links(
         torque: (n,) Nm, largest of each joint, if known.
         bodies: centres of mass (n, 3) m and inertia (n, 3, 3) kg m², as `at_far_end` returns them, if known.
     """
-    length, n = link_lengths(arm), arm.n
+    length, n = norm(arm.translation[1:]), arm.n  # [m] of each joint from the next one, or the flange
     reach = float(length[1:].sum())
     radius = TUBE_SHARE * reach * np.linspace(1.0, TAPER, n)
     mass = DENSITY * np.pi * radius**2 * (length + 2.0 * radius) if mass is None else mass

@@ -99,9 +99,8 @@ class Tubes:
 
     def placed(self, frames: FloatArray) -> FloatArray:
         """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
-        own: FloatArray = frames[..., self.link, :, :]
-        turned = np.matvec(own[..., None, :3, :3], self.ends)
-        return np.asarray(turned + own[..., None, :3, 3])
+        own = frames[..., self.link, None, :, :]
+        return np.asarray(np.matvec(own[..., :3, :3], self.ends) + own[..., :3, 3])
 
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
