@@ -56,10 +56,9 @@ def find_robot(text: str) -> Robot:
         return random_robot(int(number))
     path = user_path(text.partition("#")[0])
     if path.suffix.lower() not in {".yaml", ".yml", ".toml", ".urdf"}:
-        raise ValueError(
-            f"unknown robot {text!r}: {suggest(text, ROBOTS)}; or a file: a factory calibration (.yaml), a DH table "
-            f"(.toml) or a .urdf; or an arm that is drawn, {RANDOM_ARM}:7"
-        )
+        kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
+        wanted = f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
+        raise ValueError(f"unknown robot {text!r}: {wanted}")
     return _read(text, _changed("robot", path))
 
 

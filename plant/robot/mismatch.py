@@ -265,9 +265,7 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
         move_axis=draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
         move_angle=move,
     )
-    arm = nominal.arm if robot.measured is None else robot.measured
-    if mismatch.profile == "factory":
-        arm = measured_arm(robot, mismatch.calibration)
+    arm = measured_arm(robot, mismatch.calibration) if mismatch.profile == "factory" else robot.measured or nominal.arm
     true = replace(
         arm,
         translation=arm.translation * sample.link_scale,

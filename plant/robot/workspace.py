@@ -67,9 +67,9 @@ class Workspace:
         """Least and largest easily reached distance of the ball from the shoulder [m]."""
         return REACH[0] * self.scale, REACH[1] * self.scale
 
-    def camera_pose(self, R_BC: npt.ArrayLike = R_BC_DOWN) -> FloatArray:
-        """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3), directed at the centre."""
-        return camera_pose(R_BC, self.centre, self.camera_distance)
+    def camera_pose(self) -> FloatArray:
+        """Return X_BC, (4, 4), of the camera as planned, which looks straight down at the centre."""
+        return camera_pose(R_BC_DOWN, self.centre, self.camera_distance)
 
 
 def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> FloatArray:
