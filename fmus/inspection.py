@@ -98,9 +98,9 @@ def validate_fmu(path: Path) -> Validation:
     referenced = (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file()
     try:
         if referenced:
-            deviation = _deviation(description, root)
+            deviation = _deviation(description)
         else:
-            with closing(open_instance(description, root)) as instance:
+            with closing(open_instance(description)) as instance:
                 instance.start(0.0)
     except (FmuError, ValueError) as error:
         problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
@@ -109,14 +109,15 @@ def validate_fmu(path: Path) -> Validation:
     return Validation(tuple(problems), deviation)
 
 
-def _deviation(description: FmuDescription, root: Path) -> float:
+def _deviation(description: FmuDescription) -> float:
     """Run the FMU under the reference commands and return the largest difference of its outputs."""
+    root = description.root
     header_in, commands = read_table((root / INPUT_FILE).read_text(encoding="utf-8"))
     header_out, wanted = read_table((root / OUTPUT_FILE).read_text(encoding="utf-8"))
     inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
     if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
         raise ValueError("the reference tables do not fit the FMU's variables")
-    with closing(open_instance(description, root)) as instance:
+    with closing(open_instance(description)) as instance:
         write, read = instance.writer(inputs), instance.reader(outputs)
         times = commands[:, 0]
         instance.start(float(times[0]))

@@ -32,7 +32,7 @@ from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.library import InstanceOptions
 from servobench.plant.fmu.mapping import STEP_TOLERANCE, make_mapping
-from servobench.plant.fmu.world import STRUCTURAL, setter, structural_sizes
+from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
     "outputs": "joint_velocity_command",
@@ -88,17 +88,12 @@ class FmuController(Controller):
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
             FmuError: the FMU refused its parameters.
         """
-        root = extract_fmu(mapping.file)
-        description = read_description(mapping.file, root)
-        self._description = description.resized(structural_sizes(description, mapping.parameters))
+        self._description = read_sized(mapping.file, mapping.parameters)
         self._period, self._shape = knowledge.spec.period, (knowledge.spec.m, knowledge.spec.n)
         self._rows = self._check(mapping, knowledge.preview)
-        values = ((self._description.find(name, "parameters", None), name, each)
-                  for name, each in mapping.parameters.items())  # fmt: skip
-        setters = ((variables[0], setter(variables, name, each, ())) for variables, name, each in values)
-        self._setters = [act for _, act in sorted(setters, key=lambda pair: pair[0].causality != STRUCTURAL)]
+        self._setters = setters(self._description, mapping.parameters)
         options = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instance = open_instance(self._description, root, options=options)
+        self._instance = open_instance(self._description, options)
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)

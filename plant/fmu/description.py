@@ -47,6 +47,7 @@ class FmuDescription:
     """The part of a model description that is used here."""
 
     path: Path  # the .fmu file, for messages.
+    root: Path  # folder to which it is extracted
     version: int  # 2 or 3
     model_name: str  # for people
     identifier: str  # file name of the library
@@ -142,6 +143,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         raise ValueError(f"fmu file {path} offers scheduled execution only; wanted co-simulation or model exchange")
     return FmuDescription(
         path=path,
+        root=root,
         version=int(version[0]),
         model_name=str(description.modelName),
         identifier=_identifier(interface, path),

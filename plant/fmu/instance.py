@@ -14,7 +14,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
@@ -24,15 +23,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
-from servobench.plant.fmu.library import (
-    NO_OPTIONS,
-    InstanceOptions,
-    MessageLog,
-    condemn,
-    is_condemned,
-    load_library,
-    unload_library,
-)
+from servobench.plant.fmu.library import InstanceOptions, Library, MessageLog
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word in the names of functions, type in memory
@@ -88,33 +79,19 @@ class Instance(ABC):
     early: ClassVar[str]  # word for a step that ended early
     derivatives: ClassVar[str]  # name of the function that reads the states' derivatives
 
-    def __init__(
-        self,
-        description: FmuDescription,
-        root: Path,
-        library: Any = None,  # noqa: ANN401 - ctypes
-        options: InstanceOptions = NO_OPTIONS,
-    ) -> None:
+    def __init__(self, description: FmuDescription, options: InstanceOptions) -> None:
         """Make an instance.
-
-        Args:
-            description: of the FMU.
-            root: folder to which it is extracted.
-            library: from `load_library`, which the caller unloads; None: the instance loads one of its own.
-            options: of the instance.
 
         Raises:
             ValueError: no library for this machine, or one that cannot be loaded.
             FmuError: the FMU refused to make an instance.
         """
-        self.description = description
-        self.root = root
-        self.options = options
+        self.description, self.options = description, options
         self.log = MessageLog(description.path.name, options.debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
-        self._owns_library = library is None
-        self._library = load_library(description, root) if library is None else library
+        self._library = Library(description)
         self._component = ctypes.c_void_p()
+        self._states: list[ctypes.c_void_p] = []  # handles of saved states, freed with the instance
         try:
             self._component = ctypes.c_void_p(self._instantiate())
         except BaseException:
@@ -131,7 +108,7 @@ class Instance(ABC):
     @property
     def fatal(self) -> bool:
         """Whether it, or another instance of its library, reported a fatal error, after which nothing may be called."""
-        return self._library is not None and is_condemned(self._library)
+        return self._library.condemned
 
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
@@ -283,23 +260,32 @@ class Instance(ABC):
 
         return checked
 
-    def save(self) -> ctypes.c_void_p:
-        """Return the present state; it has to be given to `free`."""
+    def save(self) -> bytes | ctypes.c_void_p:
+        """Return the present state as bytes, or as a handle of this instance for an FMU that cannot serialise."""
+        if self.description.can_serialise:
+            return self.save_bytes()
+        self._states.append(self._state())
+        return self._states[-1]
+
+    def restore(self, saved: bytes | ctypes.c_void_p) -> None:
+        """Return to a state from `save`."""
+        if isinstance(saved, bytes):
+            self.restore_bytes(saved)
+        else:
+            self.call(f"Set{self.state}", saved)
+
+    def _state(self) -> ctypes.c_void_p:
+        """Return a handle of the present state, which has to be given to `_free`."""
         state = ctypes.c_void_p()
         self.call(f"Get{self.state}", ctypes.byref(state))
         return state
 
-    def restore(self, state: ctypes.c_void_p) -> None:
-        """Return to a saved state."""
-        self.call(f"Set{self.state}", state)
-
-    def free(self, state: ctypes.c_void_p) -> None:
-        """Free a saved state."""
+    def _free(self, state: ctypes.c_void_p) -> None:
         self.call(f"Free{self.state}", ctypes.byref(state))
 
     def save_bytes(self) -> bytes:
         """Return the present state as bytes that another process understands."""
-        state = self.save()
+        state = self._state()
         try:
             size = ctypes.c_size_t()
             self.call(f"Serialized{self.state}Size", state, ctypes.byref(size))
@@ -307,7 +293,7 @@ class Instance(ABC):
             self.call(f"Serialize{self.state}", state, content, size)
             return bytes(content)
         finally:
-            self.free(state)
+            self._free(state)
 
     def restore_bytes(self, content: bytes) -> None:
         """Return to a state from `save_bytes`."""
@@ -316,11 +302,13 @@ class Instance(ABC):
         try:
             self.restore(state)
         finally:
-            self.free(state)
+            self._free(state)
 
     def close(self) -> None:
-        """End and free the instance and unload a library of its own; calling it twice is allowed."""
+        """End and free the instance with its saved states and unload its library; calling it twice is allowed."""
         if self._component.value and not self.fatal:
+            for state in self._states:
+                self._free(state)
             if self._begun:
                 with contextlib.suppress(ValueError):  # The FMU may not export it.
                     self.function("Terminate")(self._component)
@@ -328,9 +316,7 @@ class Instance(ABC):
             release.restype = None
             release(self._component)
         self._component, self._begun = ctypes.c_void_p(), False
-        if self._owns_library and self._library is not None:
-            unload_library(self._library)
-        self._library = None
+        self._library.unload()
 
     def check(self, function: str, status: int) -> None:
         """Raise unless `status` is good.
@@ -341,7 +327,7 @@ class Instance(ABC):
         if status > WARNING or status < OK:
             self._begun = False  # After an error an instance may only be freed.
             if status == FATAL:
-                condemn(self._library)
+                self._library.condemn()
             raise self.log.failure(function, status)
 
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
@@ -357,7 +343,7 @@ class Instance(ABC):
             ValueError: the library does not have it.
         """
         try:
-            return getattr(self._library, f"{self.prefix}{name}")
+            return getattr(self._library.loaded, f"{self.prefix}{name}")
         except AttributeError as error:
             file = self.description.path.name
             raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error

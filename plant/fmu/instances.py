@@ -10,9 +10,8 @@ import math
 import os
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
-from servobench.plant.fmu.library import NO_OPTIONS, InstanceOptions, MessageLog, load_library, unload_library
+from servobench.plant.fmu.library import NO_OPTIONS, InstanceOptions, MessageLog
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
@@ -36,31 +35,10 @@ class Lane:
     step: RawCall  # takes one step
     read: RawCall  # reads joints and feature
     read_truth: RawCall  # reads the true feature and, where it is mapped, the Jacobian
-    states: list[ctypes.c_void_p] = field(default_factory=list)  # handles of saved states, freed with the instance
 
     def resting(self) -> Self:
         """Return the lane with calls that do nothing, for an instance that has failed."""
         return replace(self, write=_nothing, step=_nothing, read=_nothing, read_truth=_nothing)
-
-    def save(self, *, as_bytes: bool) -> bytes | ctypes.c_void_p:
-        """Return the state as bytes, or as a handle of this instance for an FMU that cannot serialise."""
-        if as_bytes:
-            return self.instance.save_bytes()
-        self.states.append(self.instance.save())
-        return self.states[-1]
-
-    def restore(self, saved: bytes | ctypes.c_void_p) -> None:
-        """Return to a state from `save`."""
-        if isinstance(saved, bytes):
-            self.instance.restore_bytes(saved)
-        else:
-            self.instance.restore(saved)
-
-    def close(self) -> None:
-        """Free the instance and its states."""
-        while self.states and not self.instance.fatal:
-            self.instance.free(self.states.pop())
-        self.instance.close()
 
 
 class Instances:
@@ -72,32 +50,23 @@ class Instances:
     """
 
     def __init__(
-        self,
-        description: FmuDescription,
-        root: Path,
-        fail: Callable[[int, FmuError], None],
-        options: InstanceOptions = NO_OPTIONS,
+        self, description: FmuDescription, fail: Callable[[int, FmuError], None], options: InstanceOptions
     ) -> None:
-        """Load the library; `open` makes the instances.
+        """Take an FMU, of which `open` makes instances.
 
         Args:
             description: of the FMU.
-            root: folder to which it is extracted.
             fail: takes the fault of a lane, or raises it.
             options: of each instance.
-
-        Raises:
-            ValueError: see `load_library`.
         """
-        self._description, self._root, self._fail, self._options = description, root, fail, options
-        self._library = None if description.once_per_process else load_library(description, root)
+        self._description, self._fail, self._options = description, fail, options
         self.lanes: list[Lane] = []
         self.live: list[Lane] = []
 
     def open(self, count: int, connect: Callable[[Instance, int], Lane]) -> None:
         """Make `count` instances; `connect` makes the lane of an instance with the row of its buffers."""
         for row in range(count):
-            instance = open_instance(self._description, self._root, self._library, self._options)
+            instance = open_instance(self._description, self._options)
             try:
                 self.lanes.append(connect(instance, row))
             except BaseException:
@@ -109,32 +78,25 @@ class Instances:
         """Call all instances again, also those that failed."""
         self.live = list(self.lanes)
 
-    def each(self, act: Callable[[Lane], None]) -> None:
-        """Call `act`, outside the inner loop, with each lane that has not failed."""
-        for i, lane in enumerate(self.live):
+    def each(self, act: Callable[..., None], *results: Sequence[int]) -> None:
+        """Call `act`, outside the inner loop, with each lane that has not failed and with its results."""
+        for i, (lane, *own) in enumerate(zip(self.live, *results, strict=True)):
             if lane is self.lanes[i]:
                 try:
-                    act(lane)
+                    act(lane, *own)
                 except FmuError as fault:
                     self.drop(i, fault)
 
     def check(self, verb: str, port: Port, statuses: Sequence[int]) -> None:
         """Check the statuses of calls that read or write a port."""
         if any(statuses):
-            self._settle(statuses, lambda instance, status: instance.check(f"{verb} {port.summary}", status))
+            what = f"{verb} {port.summary}"
+            self.each(lambda lane, status: lane.instance.check(what, status), statuses)
 
     def finish(self, results: Sequence[int], time: float, step: float) -> None:
         """Check the results of steps of size `step`, s, from `time`, s, and resume those that ended early."""
         if any(results):
-            self._settle(results, lambda instance, result: instance.finish(result, time, step))
-
-    def _settle(self, results: Sequence[int], settle: Callable[[Instance, int], None]) -> None:
-        for i, result in enumerate(results):
-            if result and self.live[i] is self.lanes[i]:
-                try:
-                    settle(self.lanes[i].instance, result)
-                except FmuError as fault:
-                    self.drop(i, fault)
+            self.each(lambda lane, result: lane.instance.finish(result, time, step), results)
 
     def drop(self, i: int, fault: FmuError) -> None:
         """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
@@ -146,28 +108,20 @@ class Instances:
     def keep(self, chosen: Sequence[int]) -> None:
         """Close all other instances."""
         for i in set(range(len(self.lanes))).difference(chosen):
-            self.lanes[i].close()
+            self.lanes[i].instance.close()
         self.lanes, self.live = [self.lanes[i] for i in chosen], [self.live[i] for i in chosen]
 
     def close(self) -> None:
-        """Free all instances and unload the library; calling it twice is allowed."""
+        """Free all instances; calling it twice is allowed."""
         self.live = []
         for lane in self.lanes:
-            lane.close()
-        if self._library is not None:
-            unload_library(self._library)
-            self._library = None
+            lane.instance.close()
 
 
-def open_instance(
-    description: FmuDescription,
-    root: Path,
-    library: Any = None,  # noqa: ANN401 - ctypes
-    options: InstanceOptions = NO_OPTIONS,
-) -> Instance:
-    """Return an instance of the FMU that is extracted to `root`, which the caller closes; see `Instance`."""
+def open_instance(description: FmuDescription, options: InstanceOptions = NO_OPTIONS) -> Instance:
+    """Return an instance of an FMU, which the caller closes; see `Instance`."""
     kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
-    return kind(description, root, library, options)
+    return kind(description, options)
 
 
 def _nothing() -> int:
@@ -208,7 +162,7 @@ class Instance2(Instance):
             self.description.model_name.encode(),
             ctypes.c_int(MODEL_EXCHANGE if self.description.exchange else CO_SIMULATION),
             self.description.token.encode(),
-            (self.root / "resources").as_uri().encode(),
+            (self.description.root / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
             ctypes.c_int(0),
             ctypes.c_int(self.options.debug_log is not None),
@@ -300,7 +254,7 @@ class Instance3(Instance):
         create = self.function("InstantiateModelExchange" if exchange else "InstantiateCoSimulation")
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
-        names = self.description.model_name, self.description.token, str(self.root / "resources") + os.sep
+        names = self.description.model_name, self.description.token, str(self.description.root / "resources") + os.sep
         common = [*(name.encode() for name in names), no, ctypes.c_bool(self.options.debug_log is not None)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]

@@ -16,32 +16,47 @@ from servobench.plant.fmu.description import FmuDescription
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
 
 
-def condemn(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Record a fatal error of an instance: no instance of this library may be called again."""
-    _fatal.add(library._handle)
+class Library:
+    """An instance's access to the library of its FMU, which the operating system loads once for all instances."""
+
+    def __init__(self, description: FmuDescription) -> None:
+        """Load the library for this machine.
+
+        Raises:
+            ValueError: there is none, or it cannot be loaded.
+        """
+        self.loaded: Any = _load(description)  # None after `unload`
+
+    @property
+    def condemned(self) -> bool:
+        """Whether an instance reported a fatal error, after which none may be called."""
+        return self.loaded is not None and self.loaded._handle in _fatal
+
+    def condemn(self) -> None:
+        """Record a fatal error of an instance."""
+        _fatal.add(self.loaded._handle)
+
+    def unload(self) -> None:
+        """Unload the library, unless a fatal error forbids any further call; calling it twice is allowed."""
+        from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
+
+        if self.loaded is not None and not self.condemned:
+            freeLibrary(self.loaded._handle)
+        self.loaded = None
 
 
-def is_condemned(library: Any) -> bool:  # noqa: ANN401 - a ctypes library
-    """Return whether no instance of a library may be called again."""
-    return library._handle in _fatal
-
-
-def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN401 - a ctypes library
-    """Load the FMU's library for this machine.
-
-    Raises:
-        ValueError: there is none, or it cannot be loaded.
-    """
+def _load(description: FmuDescription) -> ctypes.CDLL:
+    """Load the library, or a copy of it where it bears one instance only or an earlier one failed fatally."""
     import fmpy  # noqa: PLC0415 - see parse_description
 
-    wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
+    root, wanted = description.root, f"{description.identifier}{fmpy.sharedLibraryExtension}"
     binaries = root / "binaries"
     for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
         file = binaries / folder / wanted
         if file.is_file() and file.resolve().is_relative_to(root.resolve()):
             try:
                 library = None if description.once_per_process else ctypes.CDLL(str(file))
-                return _load_copy(file) if library is None or is_condemned(library) else library
+                return _load_copy(file) if library is None or library._handle in _fatal else library
             except OSError as error:
                 raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
         if file.parent.is_dir():
@@ -61,15 +76,6 @@ def _load_copy(file: Path) -> ctypes.CDLL:
     """Load a copy of a library and of its folder, so that it shares no variables with another instance."""
     with tempfile.TemporaryDirectory(prefix="servobench-", ignore_cleanup_errors=True) as folder:
         return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
-
-
-def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Unload the library, unless a fatal error forbids any further call."""
-    if is_condemned(library):
-        return
-    from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
-
-    freeLibrary(library._handle)
 
 
 logger = logging.getLogger("servobench.fmu")

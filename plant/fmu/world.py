@@ -97,14 +97,12 @@ class FmuWorld(World):
         self._substeps = whole_steps(period, mapping.period or period)
         self._own_step, self._period = mapping.period or period, period
         self._mapping, self.lag = mapping, lag
-        root = extract_fmu(mapping.file)
-        description = read_description(mapping.file, root)
-        self.description = description.resized(structural_sizes(description, mapping.parameters))
+        self.description = description = read_sized(mapping.file, mapping.parameters)
         if description.needs_tool:
             logger.warning("%s calls the tool that made it, which has to be installed here", mapping.file.name)
-        if model is None and (remark := unusual_step(mapping, self.description, period)):
+        if model is None and (remark := unusual_step(mapping, description, period)):
             logger.warning(remark)
-        self.spec = mapping_spec(mapping, self.description, period)
+        self.spec = mapping_spec(mapping, description, period)
         if model is not None:
             self.spec, self.noise_unit = replace(self.spec, feature=model.channel), model.noise_unit
         self._has_start = start is not None
@@ -113,7 +111,7 @@ class FmuWorld(World):
         self._start = as_array("start", start, (*self.lead, self.spec.n))
         self._rows: Any = np.arange(*self.lead) if self.lead else ()
         options = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instances = Instances(self.description, root, self.fail, options)
+        self._instances = Instances(description, self.fail, options)
         try:
             self._connect(mapping)
             self._instances.open(prod(self.lead), self._lane)
@@ -136,13 +134,11 @@ class FmuWorld(World):
         self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
         self._split = self.spec.n if mapping.joints else 0
         self._now = ctypes.c_double()
-        find = self.description.find
-        given = [(name, find(name, "parameters", None), value) for name, value in mapping.parameters.items()]
+        parameters = dict(mapping.parameters)
         if mapping.home is not None and self._has_start:
-            given.append((mapping.home, find(mapping.home, "home"), self._start))
-        setters = {name: (variables[0], setter(variables, name, value, self.lead)) for name, variables, value in given}
-        sizes_first = sorted(setters.values(), key=lambda pair: pair[0].causality != STRUCTURAL)
-        self._setters = [act for _, act in sizes_first]
+            self.description.find(mapping.home, "home")
+            parameters[mapping.home] = self._start
+        self._setters = setters(self.description, parameters, self.lead)
         self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
         self._true = build_model(mapping, self.description) if truth.states else None
         nominal = mapping.nominal
@@ -296,7 +292,7 @@ class FmuWorld(World):
         """
         if not self.description.can_save:
             raise ValueError(f"{self.description.path.name} cannot save its state (canGetAndSetFMUstate is false)")
-        saved = tuple(lane.save(as_bytes=self.description.can_serialise) for lane in self._instances.lanes)
+        saved = tuple(lane.instance.save() for lane in self._instances.lanes)
         return FmuState(saved, self._k, self._integrated)
 
     def restore(self, state: FmuState) -> None:
@@ -309,7 +305,7 @@ class FmuWorld(World):
         self._instances.revive()
         self.faults = {}
         for lane, saved in zip(self._instances.lanes, state.fmu, strict=True):
-            lane.restore(saved)
+            lane.instance.restore(saved)
         self._k, self._integrated = state.period, state.integrated
         self._measure()
 
@@ -318,19 +314,19 @@ class FmuWorld(World):
         self._instances.close()
 
 
-def structural_sizes(description: FmuDescription, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, int]:
-    """Return the values that a mapping gives to structural parameters.
+def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescription:
+    """Return the description of the FMU at `path` with the structural parameters that a mapping gives.
 
     Raises:
-        ValueError: a value that is no size.
+        ValueError: an FMU that cannot be used, a parameter that it does not have, or a value that is no size.
     """
-    sizes: dict[str, int] = {}
+    description, sizes = read_description(path, extract_fmu(path)), dict[str, int]()
     for name, value in values.items():
         variables = description.find(name, "parameters", None)
         if variables[0].causality == STRUCTURAL:
             check_value(variables, name, value)
             sizes |= {variable.name: int(np.ravel(value)[0]) for variable in variables}
-    return sizes
+    return description.resized(sizes)
 
 
 def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -> None:
@@ -360,18 +356,25 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
         raise ValueError(f"parameter {name!r} is of type {kind}: wanted {wanted}, got {came!r}")
 
 
-def setter(variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]) -> Setter:
-    """Return a function that gives a parameter its value in an instance, by the row of its run.
+def setters(
+    description: FmuDescription, parameters: Mapping[str, npt.NDArray[Any]], lead: tuple[int, ...] = ()
+) -> list[Setter]:
+    """Return functions that give parameters their values in an instance, by the row of its run; sizes come first.
 
     Args:
-        variables: that the name stands for.
-        name: for messages.
-        value: one for all of its values, or each, also for each of the runs side by side.
+        description: of the FMU.
+        parameters: by name one for all of its values, or each, also for each of the runs side by side.
         lead: leading axes of the runs.
 
     Raises:
         ValueError: a value of the wrong type or size.
     """
+    found = [(description.find(name, "parameters", None), name, value) for name, value in parameters.items()]
+    sizes_first = sorted(found, key=lambda each: each[0][0].causality != STRUCTURAL)
+    return [_setter(*each, lead) for each in sizes_first]
+
+
+def _setter(variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]) -> Setter:
     check_value(variables, name, value)
     size, given = total_size(variables), np.asarray(value)
     if given.shape not in ((), (size,), (*lead, size)):

@@ -194,7 +194,8 @@ def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, messa
 
 def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
     plant = build_ur5(Ur5FmuConfig(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
-    plant.world.description = replace(plant.world.description, can_serialise=False)
+    instance = plant.world._instances.lanes[0].instance
+    instance.description = replace(instance.description, can_serialise=False)
     plant.reset(0)
     plant.step(Command(np.full(6, 0.3)))
     state = plant.save()

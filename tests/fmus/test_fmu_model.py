@@ -32,9 +32,8 @@ class Opened:
 
     def __init__(self, version: int, start: bool = True) -> None:
         path = cached_fmu(version)
-        self.root = extract_fmu(path)
-        self.description = read_description(path, self.root)
-        self.instance = open_instance(self.description, self.root)
+        self.description = read_description(path, extract_fmu(path))
+        self.instance = open_instance(self.description)
         if start:
             self.instance.start(0.0)
 
@@ -296,7 +295,7 @@ def test_memory_stays_flat_over_a_thousand_instances(version):
 
         def live(count: int) -> None:
             for _ in range(count):
-                instance = open_instance(opened.description, opened.root)
+                instance = open_instance(opened.description)
                 instance.start(0.0)
                 advance = instance.stepper(0.05)
                 advance(0.0)

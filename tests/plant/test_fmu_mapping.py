@@ -93,7 +93,7 @@ def test_a_missing_mapping_is_told(tmp_path):
                                                      ("1", "px", True), ("", "mm", True)])  # fmt: skip
 def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
     variables = Variable("v", 0, 1, "input"), Variable("y", 1, 1, "output", unit=told)
-    described = FmuDescription(tmp_path / "a.fmu", 2, "a", "a", "", False, False, False, variables)
+    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
     mapping = FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), names=LogNames(feature_unit=given))
     if fits:
         assert mapping_spec(mapping, described, 0.05).feature_unit == given
@@ -105,7 +105,7 @@ def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given
 def test_features_that_are_the_joints_are_remarked_on(tmp_path, caplog):
     remark.cache_clear()
     variables = Variable("v", 0, 1, "input"), Variable("q", 1, 1, "output"), Variable("y", 2, 1, "output")
-    described = FmuDescription(tmp_path / "a.fmu", 2, "a", "a", "", False, False, False, variables)
+    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
     mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
     assert not caplog.text
     mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("q",), joints=("q",)), described, 0.05)
