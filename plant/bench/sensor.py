@@ -116,11 +116,9 @@ class Sensor:
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """Drop all other lanes."""
-        for stream in (
-            self._noise, self._losses, self._lateness, self._outlier_begins, self._outlier_values,
-            self._occlusion_begins,
-        ):  # fmt: skip
-            stream.keep(lanes)
+        for part in vars(self).values():
+            if isinstance(part, Stream):
+                part.keep(lanes)
         state = self._outlier, self._occlusion, self._due
         self._outlier, self._occlusion, self._due = take(state, lanes)
 

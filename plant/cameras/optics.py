@@ -64,12 +64,10 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
     Returns:
         (..., c, p, 2) [px].
     """
-    a = points[..., :2] / _depth(points)
-    if optics.further is not None:
-        return optics.centre[..., None, :] + optics.focal_lengths[..., None, :] * _bent(
-            a, optics.distortion, optics.further
-        )
-    stretch = 1.0 + optics.distortion[..., None] * (a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1])
+    a, k, further = points[..., :2] / _depth(points), optics.distortion, optics.further
+    if further is not None:
+        return optics.centre[..., None, :] + optics.focal_lengths[..., None, :] * _bent(a, k, further)
+    stretch = 1.0 + k[..., None] * (a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1])
     return optics.centre[..., None, :] + (optics.focal[..., None] * stretch)[..., None] * a
 
 
@@ -82,14 +80,12 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
         optics: of the cameras.
     """
     depth = _depth(points)
-    a, k = points[..., :2] / depth, optics.distortion[..., None, None, None]
+    a, k, further = points[..., :2] / depth, optics.distortion, optics.further
     flat = (motions[..., :2, :] - a[..., None] * motions[..., 2:, :]) / depth[..., None]
-    if optics.further is not None:
-        return np.asarray(
-            optics.focal_lengths[..., None, :, None] * (_slope(a, optics.distortion, optics.further) @ flat)
-        )
+    if further is not None:
+        return np.asarray(optics.focal_lengths[..., None, :, None] * (_slope(a, k, further) @ flat))
     square = np.vecdot(a, a)[..., None, None]
-    bent = flat + k * (square * flat + 2.0 * (outer(a, a) @ flat))
+    bent = flat + k[..., None, None, None] * (square * flat + 2.0 * (outer(a, a) @ flat))
     return np.asarray(optics.focal[..., None, None, None] * bent)
 
 

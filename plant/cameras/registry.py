@@ -35,9 +35,8 @@ class Sensing:
         if mount not in (FIXED, HAND):
             name, mount = word.strip(), FIXED
         if name not in setups:
-            raise ValueError(
-                f"unknown sensing {word!r}: {suggest(word, [*setups, *(f'{key}:{HAND}' for key in setups)])}"
-            )
+            known = [*setups, *(f"{key}:{HAND}" for key in setups)]
+            raise ValueError(f"unknown sensing {word!r}: {suggest(word, known)}")
         return cls(setups[name], HAND if mount == HAND else FIXED)
 
     def __str__(self) -> str:

@@ -8,6 +8,7 @@ set-up whose function CasADi cannot evaluate has no symbolic twin.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, NamedTuple, Self, TypeAlias
 
 import casadi
@@ -142,10 +143,7 @@ def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> 
             seen.append(casadi.logic_and(casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)))
     if setup.single:
         return casadi.vertcat(*(each for each in seen for _ in range(setup.m // len(seen))))
-    whole = seen[0]
-    for each in seen[1:]:
-        whole = casadi.logic_and(whole, each)
-    return casadi.vertcat(*[whole] * setup.m)
+    return casadi.vertcat(*[reduce(casadi.logic_and, seen)] * setup.m)
 
 
 def _shows_front(points: Expressions) -> SX:

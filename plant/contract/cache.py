@@ -10,10 +10,10 @@ flipped bit or a file cut short never reaches a run. Entries that were not used 
 import contextlib
 import fcntl
 import os
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +27,7 @@ MAX_ENTRIES: Final = 32  # number of entries of a kind that are kept if they are
 MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
 MAX_AGE: Final = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
 
+_unfinished = partial(tempfile.TemporaryDirectory, prefix=UNFINISHED, ignore_cleanup_errors=True)
 _verified: set[Path] = set()
 
 
@@ -69,8 +70,8 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
     kind = entry.parent
     try:
         kind.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=kind))
-        try:
+        with _unfinished(dir=kind) as name:
+            fresh = Path(name)
             (fresh / FILES).mkdir()
             make(fresh / FILES)
             files = [path for path in sorted((fresh / FILES).rglob("*")) if path.is_file()]
@@ -80,8 +81,6 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
                     _remove(entry)
                     fresh.rename(entry)
                 _prune(kind)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
     except OSError as error:
         raise ValueError(
             f"cache folder {kind} cannot be written: {error.strerror or error}; make room there, "
@@ -92,10 +91,8 @@ def _make(entry: Path, make: Callable[[Path], object]) -> None:
 def _remove(entry: Path) -> None:
     """Remove an entry in one step, so that no process finds a part of it under its name."""
     if entry.exists():
-        aside = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=entry.parent))
-        with contextlib.suppress(FileNotFoundError):
-            entry.rename(aside / entry.name)
-        shutil.rmtree(aside, ignore_errors=True)
+        with _unfinished(dir=entry.parent) as aside, contextlib.suppress(FileNotFoundError):
+            entry.rename(Path(aside) / entry.name)
 
 
 def _prune(kind: Path) -> None:

@@ -104,7 +104,9 @@ def fault(folder: Path, name: str, sums: Sums | None) -> str | None:
             return "is no file"
         if sums is not None and name in sums and digest(path) in sums[name]:
             return None
-        end = _end(path)
+        with path.open("rb") as file:
+            file.seek(max(0, size - len(TABLE_END)))
+            end = file.read()
     except FileNotFoundError:
         return "is missing"
     except OSError as error:
@@ -133,9 +135,3 @@ def _version(path: Path) -> tuple[int, int, int, int]:
     """Return numbers that differ once a file was written again."""
     stat = path.stat()
     return stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size, stat.st_ino
-
-
-def _end(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - len(TABLE_END)))
-        return file.read()

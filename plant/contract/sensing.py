@@ -40,10 +40,6 @@ from servobench.plant.contract.settings import (
 
 Family: TypeAlias = Literal["white", "mixture", "bimodal", "stable", "uniform"]
 """A family of noise."""
-Stability: TypeAlias = Annotated[float, Ge(0.5), Le(2.0)]
-"""Exponent α of a stable distribution; below 0.5 its numbers tell nothing."""
-Skewness: TypeAlias = Annotated[float, Ge(-1.0), Le(1.0)]
-"""From −1 to 1."""
 
 
 @settings
@@ -73,9 +69,9 @@ class SensingConfig:
     """[m or px] μ, by how much it is displaced."""
     noise_spread: Positive = 1.0
     """[1] κ, deviation of the displaced part of "mixture" over σ."""
-    stability: Stability = 1.5
+    stability: Annotated[float, Ge(0.5), Le(2.0)] = 1.5  # below 0.5 the numbers tell nothing
     """[1] α, exponent of the family "stable": 2 is white, 1 is Cauchy."""
-    skewness: Skewness = 0.0
+    skewness: Annotated[float, Ge(-1.0), Le(1.0)] = 0.0
     """[1] β, skewness of the family "stable"."""
     quantum: Extent = 0.0
     """[m or px] the feature is rounded to multiples of it; 0: it is not."""

@@ -26,19 +26,7 @@ from functools import cache, partial, wraps
 from itertools import pairwise
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import (
-    Annotated,
-    Any,
-    Final,
-    NamedTuple,
-    Self,
-    TypeAlias,
-    TypeVar,
-    cast,
-    dataclass_transform,
-    get_args,
-    get_type_hints,
-)
+from typing import Annotated, Any, Final, Self, TypeAlias, TypeVar, cast, dataclass_transform, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -254,7 +242,8 @@ def with_tuples(value: Any) -> Any:  # noqa: ANN401 - any value of TOML
     return tuple(map(with_tuples, value)) if isinstance(value, list) else value
 
 
-class Check(NamedTuple):
+@plain_dataclass(frozen=True)
+class Check:
     """How a value is checked: its type with bounds, and the usual sizes of its numbers."""
 
     type: TypeAdapter[Any]
@@ -291,14 +280,9 @@ def field_strings(kind: type[Any]) -> dict[str, str]:
             continue
         definition = ast.parse(textwrap.dedent(source)).body[0]
         for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
-            if (
-                isinstance(item, ast.AnnAssign)
-                and isinstance(item.target, ast.Name)
-                and isinstance(below, ast.Expr)
-                and isinstance(below.value, ast.Constant)
-                and isinstance(below.value.value, str)
-            ):
-                strings[item.target.id] = " ".join(below.value.value.split())
+            match item, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    strings[name] = " ".join(text.split())
     return strings
 
 

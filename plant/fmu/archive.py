@@ -45,7 +45,11 @@ def extract_fmu(path: Path) -> Path:
 
 
 def _extract(path: Path, folder: Path) -> None:
-    with _open(path) as archive:
+    try:
+        archive = zipfile.ZipFile(path)
+    except DAMAGES as error:
+        raise ValueError(f"fmu file {path} is not a zip archive: {error}") from error
+    with archive:
         entries = archive.infolist()
         _check_names(path, entries)
         _check_sizes(path, entries)
@@ -56,13 +60,6 @@ def _extract(path: Path, folder: Path) -> None:
                 if isinstance(error, OSError) and error.errno in DISK:
                     raise
                 raise ValueError(f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}") from error
-
-
-def _open(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except DAMAGES as error:
-        raise ValueError(f"fmu file {path} is not a zip archive: {error}") from error
 
 
 def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
