@@ -12,7 +12,7 @@ from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.methods import with_aids
 from servobench.controllers.servo import Servo, ServoState
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, findings_of, report
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, report
 from servobench.harness.check.rig import PERIOD, PREVIEW, Conditions, Driver, Rig, attributes, differing, watching_draws
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
@@ -56,7 +56,7 @@ def check_controller(
     """
     with offering():
         name = choose_controller(controller)
-        return report(name, findings_of(ControllerChecks(find_controller(name)).checks(), begin), found)
+        return report(name, ControllerChecks(find_controller(name)).checks(), begin, found)
 
 
 class ControllerChecks:

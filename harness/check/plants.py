@@ -1,12 +1,12 @@
 """The contract of a plant, checked on a mismatched arm: `check_plant`."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of, report
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, report
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.harness.run.contract import HeldPlant
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
@@ -46,7 +46,8 @@ def check_plant(
     """
     with offering():
         entry = plant if isinstance(plant, PlantEntry) else find_plant(choose_plant(plant))
-        return report(entry.name, PlantChecks(entry).carry_out(begin), found)
+        with contextlib.closing(PlantChecks(entry)) as checks:
+            return report(entry.name, checks.checks(), begin, found)
 
 
 class PlantChecks:
@@ -56,14 +57,11 @@ class PlantChecks:
         """Prepare the checks."""
         self.entry, self._plant = entry, list[Plant]()
 
-    def carry_out(self, begin: Callable[[str], None]) -> Iterator[Finding]:
-        """Yield the finding of each check; the plant is closed at the end."""
-        try:
-            yield from findings_of(self.checks(), begin)
-        finally:
-            for plant in self._plant:
-                with contextlib.suppress(Exception):  # the check of `close` has reported it
-                    plant.close()
+    def close(self) -> None:
+        """Close the plant."""
+        for plant in self._plant:
+            with contextlib.suppress(Exception):  # the check of it has reported it
+                plant.close()
 
     def checks(self) -> list[Check]:
         """Return the checks in their order."""
@@ -77,7 +75,7 @@ class PlantChecks:
             Check("negative seed", self.negative_seed, run),
             Check("truth", self.truth, run),
             Check("save", self.save, (*run, "repeatable")),
-            Check("close", self.close, run),
+            Check("close", self.closing, run),
         ]
 
     def build(self) -> None:
@@ -117,19 +115,15 @@ class PlantChecks:
         """A command of the wrong size is refused."""
         plant = self._plant[0]
         plant.reset(0)
-        try:
+        with contextlib.suppress(ValueError):
             plant.step(Command(np.zeros(plant.spec.n + 1)))
-        except ValueError:
-            return
-        raise CheckFailed(f"step must refuse {plant.spec.n + 1} joint velocities by a ValueError")
+            raise CheckFailed(f"step must refuse {plant.spec.n + 1} joint velocities by a ValueError")
 
     def negative_seed(self) -> None:
         """A negative seed is refused."""
-        try:
+        with contextlib.suppress(ValueError):
             self._plant[0].reset(-1)
-        except ValueError:
-            return
-        raise CheckFailed("reset must refuse the seed -1 by a ValueError")
+            raise CheckFailed("reset must refuse the seed -1 by a ValueError")
 
     def truth(self) -> str | None:
         """The true Jacobian predicts how the true feature moves."""
@@ -164,7 +158,7 @@ class PlantChecks:
             raise CheckFailed("after restore the run goes on otherwise: save must return all that step changes")
         return None
 
-    def close(self) -> None:
+    def closing(self) -> None:
         """Closing twice is allowed and closes no other plant."""
         other = self._build()
         other.close()

@@ -1,7 +1,7 @@
 """Findings of checks: each ok, failed or a note."""
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
@@ -55,15 +55,6 @@ class Report:
     __repr__ = __str__
 
 
-def report(subject: str, findings: Iterable[Finding], found: Callable[[Finding], None]) -> Report:
-    """Return the findings about a subject; each is handed to `found` as soon as it is there."""
-    kept = []
-    for finding in findings:
-        kept.append(finding)
-        found(finding)
-    return Report(subject, tuple(kept))
-
-
 class CheckFailed(Exception):
     """A check found a defect; the message names the remedy."""
 
@@ -78,30 +69,37 @@ class Check(NamedTuple):
     """checks without which this one finds nothing new"""
 
 
-def findings_of(checks: Iterable[Check], begin: Callable[[str], None]) -> Iterator[Finding]:
-    """Carry out checks one after the other and yield the finding of each.
+def report(
+    subject: str, checks: Iterable[Check], begin: Callable[[str], None], found: Callable[[Finding], None]
+) -> Report:
+    """Carry out checks one after the other and return their findings.
 
     Args:
-        checks: a check is left out if one that it needs was not ok.
+        subject: of the checks.
+        checks: a check is left out if one that it needs failed.
         begin: called with the name of each check before it is carried out.
+        found: called with each finding as soon as it is there.
     """
-    good: set[str] = set()
+    findings: list[Finding] = []
     for check in checks:
-        if not good.issuperset(check.needs):
-            continue
-        begin(check.name)
-        try:
-            with np.errstate(divide="raise", over="raise", invalid="raise"):
-                note = check.carry_out()
-        except (CheckFailed, ConfigurationError) as error:
-            yield Finding(check.name, "failed", str(error))
-        except WrongAnswer as error:
-            yield Finding(check.name, "failed", f"{at(error.method)}: {error}")
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
-            yield Finding(check.name, "failed", describe_at(error) + _remedy(error))
-        else:
-            good.add(check.name)
-            yield Finding(check.name, "note", note) if note else Finding(check.name, "ok")
+        if {each.check for each in findings if each.verdict != "failed"}.issuperset(check.needs):
+            begin(check.name)
+            findings.append(_finding(check))
+            found(findings[-1])
+    return Report(subject, tuple(findings))
+
+
+def _finding(check: Check) -> Finding:
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            note = check.carry_out()
+    except (CheckFailed, ConfigurationError) as error:
+        return Finding(check.name, "failed", str(error))
+    except WrongAnswer as error:
+        return Finding(check.name, "failed", f"{at(error.method)}: {error}")
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
+        return Finding(check.name, "failed", describe_at(error) + _remedy(error))
+    return Finding(check.name, "note", note) if note else Finding(check.name, "ok")
 
 
 def at(method: Any) -> str:  # noqa: ANN401 - a method or a function

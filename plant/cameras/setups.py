@@ -225,12 +225,11 @@ class SetupModel(RobotModel):
 
     def with_lens(self, deviation: FloatArray) -> Self:
         """Return this model with deviating intrinsics; see `RobotModel.with_lens`."""
-        focal, u, v, bend = deviation
-        lens, centre = self.optics, np.array([u, v])
-        optics = replace(
-            lens, focal=lens.focal * (1.0 + focal), centre=lens.centre + centre, distortion=lens.distortion + bend
+        lens, (focal, *shift, bend) = self.optics, deviation
+        centre, distortion = lens.centre + np.array(shift), lens.distortion + bend
+        return replace(
+            self, optics=replace(lens, focal=lens.focal * (1.0 + focal), centre=centre, distortion=distortion)
         )
-        return replace(self, optics=optics)
 
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""

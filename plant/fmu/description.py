@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import prod
+from operator import itemgetter
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Final, Self
@@ -75,10 +76,7 @@ class FmuDescription:
             if match is not None:
                 index = tuple(int(part) for part in match[2].split(","))
                 families.setdefault(match[1] + match[3], []).append((index, variable))
-        return {
-            name: [member for _, member in sorted(members, key=lambda pair: pair[0])]
-            for name, members in families.items()
-        }
+        return {name: [member for _, member in sorted(pairs, key=itemgetter(0))] for name, pairs in families.items()}
 
     def find(self, name: str, role: str, types: Container[str] | None = REAL_TYPES) -> list[Variable]:
         """Return the variables that `name` stands for.

@@ -12,7 +12,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from servobench.plant.fmu.library import NO_OPTIONS, InstanceOptions, MessageLog
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
+# Whole numbers of FMI 3 -> their type in memory.
+WHOLE_TYPES: Final = {f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,11 +235,7 @@ class Instance3(Instance):
     kinds: ClassVar[Kinds] = {
         "Float64": ("Float64", np.float64),
         "Float32": ("Float32", np.float32),
-        **{
-            f"{sign}Int{bits}": (f"{sign}Int{bits}", f"{sign}int{bits}".lower())
-            for sign in ("", "U")
-            for bits in (8, 16, 32, 64)
-        },
+        **{word: (word, kind) for word, kind in WHOLE_TYPES.items()},
         "Enumeration": ("Int64", np.int64),
         "Boolean": ("Boolean", np.bool_),
     }

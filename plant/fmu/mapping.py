@@ -154,9 +154,7 @@ def make_mapping(kind: type[Roles], path: Path, table: Mapping[str, Any]) -> Rol
     Raises:
         ValueError: a missing or unknown key, or a value of the wrong kind.
     """
-    needed = [
-        each.name for each in fields(cast(Any, kind)) if each.default is MISSING and each.default_factory is MISSING
-    ]
+    needed = [each.name for each in fields(cast(Any, kind)) if each.default is each.default_factory is MISSING]
     for key in needed:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
@@ -191,9 +189,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     if not (n and m):
         raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
     if mapping.features == mapping.joints:
-        remark(
-            f"features of the mapping are its joints, {', '.join(mapping.joints)}; a camera measures other quantities"
-        )
+        joints = ", ".join(mapping.joints)
+        remark(f"features of the mapping are its joints, {joints}; a camera measures other quantities")
     truth = mapping.truth
     for name, names, size in (
         ("joints", mapping.joints, n),

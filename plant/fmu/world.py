@@ -26,7 +26,7 @@ from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instance import Instance, Port
-from servobench.plant.fmu.instances import Instances, Lane
+from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane
 from servobench.plant.fmu.library import InstanceOptions, logger
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import build_model
@@ -35,9 +35,7 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
-INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32"} | {
-    f"{sign}Int{bits}": f"{sign}int{bits}".lower() for sign in ("", "U") for bits in (8, 16, 32, 64)
-}
+INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
 EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
 

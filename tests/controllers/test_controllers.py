@@ -20,7 +20,7 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.fit import train
 from servobench.controllers.servo import ServoController
 from servobench.harness.check.controllers import ControllerChecks
-from servobench.harness.check.report import findings_of
+from servobench.harness.check.report import report
 from servobench.harness.config.settings import default_config
 from servobench.plant.contract.signals import Observation
 
@@ -91,12 +91,10 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
 
 @pytest.mark.parametrize("entry", [*EQUIPPED, nmpc_calibrated.ENTRY], ids=lambda entry: entry.name)
 def test_a_method_keeps_the_contract_of_controllers(entry):
-    checked = list(findings_of(ControllerChecks(entry).checks(), lambda _name: None))
-    defects = [
-        each for each in checked if each.verdict == "failed" and each.check != "time"
-    ]  # which the machine decides
+    checked = report(entry.name, ControllerChecks(entry).checks(), lambda _name: None, lambda _finding: None)
+    defects = [each for each in checked.failures if each.check != "time"]  # which the machine decides
     assert not defects
-    assert len(checked) == 18
+    assert len(checked.findings) == 18
 
 
 @pytest.mark.parametrize("entry", COMPOSED)
