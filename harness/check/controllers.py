@@ -127,9 +127,8 @@ class ControllerChecks:
         held.diagnostics()
         J = held.estimated_jacobian()
         if J is not None and not np.isfinite(J).all():
-            raise CheckFailed(
-                f"{at(driver.controller.estimated_jacobian)}: estimated_jacobian must return finite numbers or None"
-            )
+            place = at(driver.controller.estimated_jacobian)
+            raise CheckFailed(f"{place}: estimated_jacobian must return finite numbers or None")
 
     def repeatable(self) -> None:
         """The same seed gives the same commands."""
@@ -158,10 +157,8 @@ class ControllerChecks:
         kept = differing(new, attributes(used.begin().controller))
         again = used.run(self.steps)
         if not np.array_equal(first, again):
-            name = f" in self.{', self.'.join(kept)}" if kept else ""
-            raise CheckFailed(
-                f"{at(used.controller.reset)}: reset keeps values of an earlier run{name}; set it anew there"
-            )
+            place, name = at(used.controller.reset), f" in self.{', self.'.join(kept)}" if kept else ""
+            raise CheckFailed(f"{place}: reset keeps values of an earlier run{name}; set it anew there")
 
     def separate(self) -> None:
         """Two controllers in one process do not disturb each other."""

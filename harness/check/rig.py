@@ -79,15 +79,11 @@ class Rig(Plant):
 
     def knowledge(self, *, truth: bool = False, preview: int = PREVIEW) -> RobotKnowledge:
         """Return the knowledge of a controller; with `truth` also that of an upper bound."""
-        n = self.spec.n
-        known = RobotKnowledge(
-            self.spec, preview, self.model_jacobian, region=(np.full(n, -1.0), np.full(n, 1.0)), train=self._train
-        )
+        side, delays = np.ones(self.spec.n), Delays(0.0, 0.0, 0.0)
+        known = RobotKnowledge(self.spec, preview, self.model_jacobian, region=(-side, side), train=self._train)
         if not truth:
             return known
-        return replace(
-            known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=Delays(0.0, 0.0, 0.0)
-        )
+        return replace(known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=delays)
 
     def reset(self, seed: int) -> Observation:
         """See `Plant.reset`; the arm stands at its start, or at its goal."""

@@ -10,11 +10,8 @@ ENVIRONMENT: Final = "servobench/Servo-v0"
 def register() -> None:
     """Make the environment known to `gymnasium.make` and `make_vec`; once is enough."""
     if ENVIRONMENT not in gymnasium.registry:
-        gymnasium.register(
-            ENVIRONMENT,
-            entry_point="servobench.harness.gym.environment:ServoEnv",
-            vector_entry_point="servobench.harness.gym.environment:ServoVectorEnv",
-        )
+        place = "servobench.harness.gym.environment"
+        gymnasium.register(ENVIRONMENT, entry_point=f"{place}:ServoEnv", vector_entry_point=f"{place}:ServoVectorEnv")
 
 
 register()

@@ -339,11 +339,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        **choice: Any,  # noqa: ANN401 - typed by `ServoEnv`
-    ) -> None:
+    def __init__(self, num_envs: int = 1, **choice: Any) -> None:  # noqa: ANN401 - typed by `ServoEnv`
         """Look everything up.
 
         Args:

@@ -34,7 +34,7 @@ from servobench.plant.cameras.optics import Optics, in_image, project, project_r
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import SETTLING_BAND, BoolArray, Channel
-from servobench.plant.robot.arm import YZX, ZXY, SerialArm
+from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -277,7 +277,7 @@ class SetupModel(RobotModel):
         frames = self.arm.frames(joint_position)
         flange = frames[..., -1, :, :]
         at = self._in_base(flange)
-        motions = self._motions(frames, at)
+        motions = self.arm.motions(frames, at)
         if self.mount == "hand":
             motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
         points = self._in_cameras(self._mounted(flange, at))
@@ -306,16 +306,6 @@ class SetupModel(RobotModel):
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
         cameras = self.cameras[..., None, :, :]
         return np.asarray(np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3]))
-
-    def _motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
-        """Return g_i z_i × (p − o_i) of points (..., p, 3) m in the base frame, (..., p, n, 3) m/rad."""
-        n = self.arm.n
-        axis = frames[..., None, :n, :3, 2]
-        lever = points[..., :, None, :] - frames[..., None, :n, :3, 3]
-        motions = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
-        motions -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
-        motions *= self.arm.gear_ratio[..., None, :, None]
-        return np.asarray(motions)
 
 
 def _incidence(points: FloatArray) -> FloatArray:

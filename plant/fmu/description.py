@@ -177,17 +177,15 @@ def read_exchange(path: Path, root: Path) -> None:
     """
     description = parse_description(path, root)
     version, exchange = str(description.fmiVersion), description.modelExchange
-    wanted = "wanted FMI 2 with model exchange and directional derivatives"
+    wanted, hidden = "wanted FMI 2 with model exchange and directional derivatives", "so its Jacobian cannot be read"
     if not version.startswith("2."):
-        raise ValueError(f"fmu file {path} is of FMI {version}, so its Jacobian cannot be read; {wanted}")
+        raise ValueError(f"fmu file {path} is of FMI {version}, {hidden}; {wanted}")
     if exchange is None:
-        raise ValueError(f"fmu file {path} offers no model exchange, so its Jacobian cannot be read; {wanted}")
+        raise ValueError(f"fmu file {path} offers no model exchange, {hidden}; {wanted}")
     if not exchange.providesDirectionalDerivative:
-        raise ValueError(f"fmu file {path} has no directional derivatives, so its Jacobian cannot be read; {wanted}")
+        raise ValueError(f"fmu file {path} has no directional derivatives, {hidden}; {wanted}")
     if exchange.canBeInstantiatedOnlyOncePerProcess:
-        raise ValueError(
-            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read during a run"
-        )
+        raise ValueError(f"fmu file {path} allows one instance in a process, {hidden} during a run")
 
 
 def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's classes carry no usable types

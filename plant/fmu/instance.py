@@ -201,11 +201,8 @@ class Instance(ABC):
             function = self.function(f"{verb}{self.real}")
             return partial(function, self._component, *port.variables, *self._row(port, row))
         values = port.values.reshape(-1, port.values.shape[-1])[row]
-        ends = np.cumsum([variable.size for variable in port.members]).tolist()
-        calls = [
-            self._converted(verb, variable, values[end - variable.size : end])
-            for variable, end in zip(port.members, ends, strict=True)
-        ]
+        parts = np.split(values, np.cumsum([variable.size for variable in port.members])[:-1])
+        calls = [self._converted(verb, *each) for each in zip(port.members, parts, strict=True)]
         return lambda: max(call() for call in calls)
 
     def _row(self, port: Port, row: int) -> tuple[Any, ...]:

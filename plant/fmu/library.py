@@ -50,7 +50,7 @@ def _load(description: FmuDescription) -> ctypes.CDLL:
     import fmpy  # noqa: PLC0415 - see parse_description
 
     root, wanted = description.root, f"{description.identifier}{fmpy.sharedLibraryExtension}"
-    binaries = root / "binaries"
+    binaries, lacking = root / "binaries", f"fmu file {description.path} has no library for this machine; wanted"
     for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
         file = binaries / folder / wanted
         if file.is_file() and file.resolve().is_relative_to(root.resolve()):
@@ -61,15 +61,9 @@ def _load(description: FmuDescription) -> ctypes.CDLL:
                 raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
         if file.parent.is_dir():
             there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
-            raise ValueError(
-                f"fmu file {description.path} has no library for this machine; "
-                f"wanted binaries/{folder}/{wanted}, it has there: {there}"
-            )
+            raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
     there = ", ".join(sorted(folder.name for folder in binaries.iterdir())) if binaries.is_dir() else ""
-    raise ValueError(
-        f"fmu file {description.path} has no library for this machine; "
-        f"wanted {fmpy.platform_tuple}, it has: {there or 'none'}"
-    )
+    raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
 
 
 def _load_copy(file: Path) -> ctypes.CDLL:

@@ -125,13 +125,17 @@ class SerialArm:
         """Return `ball_position` and `ball_jacobian` at the cost of one forward kinematics."""
         frames = self.frames(joint_position)
         ball = self._ball(frames)
-        axis = frames[..., : self.n, :3, 2]
-        lever = ball[..., None, :] - frames[..., : self.n, :3, 3]
+        return ball, np.swapaxes(self.motions(frames, ball[..., None, :])[..., 0, :, :], -1, -2)
+
+    def motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
+        """Return g_i z_i × (p − o_i), (..., p, n, 3) m/rad, for points (..., p, 3) m of the base frame and `frames`."""
+        axis = frames[..., None, : self.n, :3, 2]
+        lever = points[..., None, :] - frames[..., None, : self.n, :3, 3]
         # numpy.cross would cost as much as the forward kinematics.
-        columns = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
-        columns -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
-        columns *= self.gear_ratio[..., None]
-        return ball, np.swapaxes(columns, -1, -2)
+        motions = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
+        motions -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
+        motions *= self.gear_ratio[..., None, :, None]
+        return np.asarray(motions)
 
     def _ball(self, frames: FloatArray) -> FloatArray:
         flange = frames[..., -1, :, :]
