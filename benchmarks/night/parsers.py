@@ -97,7 +97,7 @@ def _mismatch(text: str, _: Path) -> None:
 
 
 def _mapping(text: str, folder: Path) -> None:
-    read_mapping(_written(folder / "mapping.toml", text))
+    read_mapping(FmuMapping, _written(folder / "mapping.toml", text))
 
 
 def _robot(ending: str) -> Callable[[str, Path], object]:

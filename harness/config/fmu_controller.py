@@ -14,7 +14,7 @@ import contextlib
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple, final
+from typing import Annotated, Any, Final, NamedTuple, final
 
 import numpy as np
 from annotated_types import MinLen
@@ -23,15 +23,13 @@ from servobench.controllers.controller import Controller, ControllerEntry, Robot
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError, configuration_errors
-from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import File, Names, Positive, Values, nested, remark, settings
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.library import InstanceOptions
-from servobench.plant.fmu.mapping import STEP_TOLERANCE, make_mapping
+from servobench.plant.fmu.mapping import STEP_TOLERANCE, read_mapping
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -92,8 +90,7 @@ class FmuController(Controller):
         self._period, self._shape = knowledge.spec.period, (knowledge.spec.m, knowledge.spec.n)
         self._rows = self._check(mapping, knowledge.preview)
         self._setters = setters(self._description, mapping.parameters)
-        options = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instance = open_instance(self._description, options)
+        self._instance = open_instance(self._description, mapping.tolerance, mapping.debug_log)
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)
@@ -205,7 +202,7 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
     if path.suffix == ".fmu":
         mapping, how = _conventional(path), "by the names of exported controllers"
     else:
-        mapping = make_mapping(ControllerMapping, path, read_toml("mapping", path))
+        mapping = read_mapping(ControllerMapping, path)
         how = f"as mapped by {path.name}"
 
     @configuration_errors("", FmuError)
@@ -223,14 +220,14 @@ def _conventional(path: Path) -> ControllerMapping:
         ValueError: not an FMU, or without such names.
     """
     description = read_description(path, extract_fmu(path))
-    names = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
+    names: dict[str, Any] = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
     lacking = [CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names]
     if lacking:
         raise ValueError(
             f"{path.name} has no {', '.join(lacking)}, as exported controllers have; write a mapping of its names, "
             f"such as {path.stem}.toml"
         )
-    return make_mapping(ControllerMapping, path, {"file": path.name, **names})
+    return ControllerMapping(path, **names)
 
 
 def _has(description: FmuDescription, name: str) -> bool:

@@ -14,6 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
@@ -23,7 +24,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
-from servobench.plant.fmu.library import InstanceOptions, Library, MessageLog
+from servobench.plant.fmu.library import Library, MessageLog
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word in the names of functions, type in memory
@@ -79,15 +80,10 @@ class Instance(ABC):
     early: ClassVar[str]  # word for a step that ended early
     derivatives: ClassVar[str]  # name of the function that reads the states' derivatives
 
-    def __init__(self, description: FmuDescription, options: InstanceOptions) -> None:
-        """Make an instance.
-
-        Raises:
-            ValueError: no library for this machine, or one that cannot be loaded.
-            FmuError: the FMU refused to make an instance.
-        """
-        self.description, self.options = description, options
-        self.log = MessageLog(description.path.name, options.debug_log)
+    def __init__(self, description: FmuDescription, tolerance: float | None, debug_log: Path | None) -> None:
+        """Make an instance; see `open_instance`."""
+        self.description, self.tolerance, self._debugs = description, tolerance, debug_log is not None
+        self.log = MessageLog(description.path.name, debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
         self._library = Library(description)
         self._component = ctypes.c_void_p()
@@ -432,7 +428,7 @@ class Integrator:
             set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
             input=SimpleNamespace(apply=lambda _time: None),  # Inputs stay as they are within a step.
             startTime=time,
-            relativeTolerance=self._instance.options.tolerance or RELATIVE_TOLERANCE,
+            relativeTolerance=self._instance.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 

@@ -12,6 +12,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
-from servobench.plant.fmu.library import NO_OPTIONS, InstanceOptions, MessageLog
+from servobench.plant.fmu.library import MessageLog
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
@@ -51,24 +52,16 @@ class Instances:
         live: the same for the inner loop, where those that failed rest; empty after `close`.
     """
 
-    def __init__(
-        self, description: FmuDescription, fail: Callable[[int, FmuError], None], options: InstanceOptions
-    ) -> None:
-        """Take an FMU, of which `open` makes instances.
-
-        Args:
-            description: of the FMU.
-            fail: takes the fault of a lane, or raises it.
-            options: of each instance.
-        """
-        self._description, self._fail, self._options = description, fail, options
+    def __init__(self, fail: Callable[[int, FmuError], None]) -> None:
+        """Begin without lanes; `fail` takes the fault of a lane, or raises it."""
+        self._fail = fail
         self.lanes: list[Lane] = []
         self.live: list[Lane] = []
 
-    def open(self, count: int, connect: Callable[[Instance, int], Lane]) -> None:
+    def open(self, count: int, make: Callable[[], Instance], connect: Callable[[Instance, int], Lane]) -> None:
         """Make `count` instances; `connect` makes the lane of an instance with the row of its buffers."""
         for row in range(count):
-            instance = open_instance(self._description, self._options)
+            instance = make()
             try:
                 self.lanes.append(connect(instance, row))
             except BaseException:
@@ -120,10 +113,22 @@ class Instances:
             lane.instance.close()
 
 
-def open_instance(description: FmuDescription, options: InstanceOptions = NO_OPTIONS) -> Instance:
-    """Return an instance of an FMU, which the caller closes; see `Instance`."""
+def open_instance(
+    description: FmuDescription, tolerance: float | None = None, debug_log: Path | None = None
+) -> Instance:
+    """Return an instance of an FMU, which the caller closes.
+
+    Args:
+        description: of the FMU.
+        tolerance: relative one of its own solver, or of CVode in model exchange; None: the solver's own.
+        debug_log: file to which all of its messages are appended, with its debug log turned on; None: it is off.
+
+    Raises:
+        ValueError: no library for this machine, or one that cannot be loaded.
+        FmuError: the FMU refused to make an instance.
+    """
     kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
-    return kind(description, options)
+    return kind(description, tolerance, debug_log)
 
 
 def _nothing() -> int:
@@ -167,12 +172,12 @@ class Instance2(Instance):
             (self.description.root / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
             ctypes.c_int(0),
-            ctypes.c_int(self.options.debug_log is not None),
+            ctypes.c_int(self._debugs),
         )
         return address
 
     def _initialise(self, time: float) -> None:
-        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.options.tolerance
+        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.tolerance
         wanted = ctypes.c_int(tolerance is not None), ctypes.c_double(tolerance or 0.0)
         self.call("SetupExperiment", *wanted, ctypes.c_double(time), no, nothing)
         self.call("EnterInitializationMode")
@@ -253,14 +258,14 @@ class Instance3(Instance):
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
         names = self.description.model_name, self.description.token, str(self.description.root / "resources") + os.sep
-        common = [*(name.encode() for name in names), no, ctypes.c_bool(self.options.debug_log is not None)]
+        common = [*(name.encode() for name in names), no, ctypes.c_bool(self._debugs)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]
         address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
         return address
 
     def _initialise(self, time: float) -> None:
-        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.options.tolerance
+        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.tolerance
         wanted = ctypes.c_bool(tolerance is not None), ctypes.c_double(tolerance or 0.0)
         self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")

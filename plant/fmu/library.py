@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -122,16 +121,3 @@ class MessageLog:
         said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
         self._last.clear()
         return FmuError(f"{self._name}: {function} returned {word}{said}")
-
-
-@dataclass(frozen=True)
-class InstanceOptions:
-    """Options of an instance."""
-
-    # relative one of its own solver, or of CVode in model exchange; None: the solver's own
-    tolerance: float | None = None
-    # file to which all of its messages are appended, with its debug log turned on; None: it is off
-    debug_log: Path | None = None
-
-
-NO_OPTIONS = InstanceOptions()

@@ -134,26 +134,17 @@ class FmuMapping:
             raise ValueError("start needs home, the parameter that takes it: the FMU has joints of its own")
 
 
-def read_mapping(path: Path) -> FmuMapping:
+def read_mapping(kind: type[Roles], path: Path) -> Roles:
     """Read a mapping from a TOML file.
-
-    Raises:
-        ValueError: an unreadable or malformed file, an unknown key, or a value of the wrong kind.
-    """
-    return make_mapping(FmuMapping, path, read_toml("mapping", path))
-
-
-def make_mapping(kind: type[Roles], path: Path, table: Mapping[str, Any]) -> Roles:
-    """Return the mapping that the keys of a file make.
 
     Args:
         kind: class of the mapping, with a `file` and a `debug_log`, whose paths begin in the folder of the file.
         path: of the file.
-        table: its keys.
 
     Raises:
-        ValueError: a missing or unknown key, or a value of the wrong kind.
+        ValueError: an unreadable or malformed file, a missing or unknown key, or a value of the wrong kind.
     """
+    table = read_toml("mapping", path)
     needed = [each.name for each in fields(cast(Any, kind)) if each.default is each.default_factory is MISSING]
     for key in needed:
         if key not in table:

@@ -8,6 +8,7 @@ are set before every run.
 import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any, Final
@@ -26,8 +27,8 @@ from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instance import Instance, Port
-from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane
-from servobench.plant.fmu.library import InstanceOptions, logger
+from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
+from servobench.plant.fmu.library import logger
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import build_model
 from servobench.plant.robot.arm import rpy_from_rotation
@@ -108,11 +109,11 @@ class FmuWorld(World):
         self.lead = np.shape(start)[:-1]
         self._start = as_array("start", start, (*self.lead, self.spec.n))
         self._rows: Any = np.arange(*self.lead) if self.lead else ()
-        options = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instances = Instances(description, self.fail, options)
+        self._instances = Instances(self.fail)
         try:
             self._connect(mapping)
-            self._instances.open(prod(self.lead), self._lane)
+            make = partial(open_instance, description, mapping.tolerance, mapping.debug_log)
+            self._instances.open(prod(self.lead), make, self._lane)
             self._initialise()
             self._refuse_faults()
         except BaseException:
@@ -421,7 +422,7 @@ def fmu_entry(path: Path) -> PlantEntry:
     """
     if path.suffix == ".fmu":
         raise ValueError(f"plant {path} needs a mapping, a TOML that names file, inputs and features")
-    mapping = read_mapping(path)
+    mapping = read_mapping(FmuMapping, path)
 
     def build(config: FmuConfig, setup: PlantSetup) -> Bench:
         return build_fmu(mapping, setup, config.command_delay, config.sensing)

@@ -47,7 +47,7 @@ def test_a_file_gives_truth_values_and_texts(tmp_path):
     build_crane(tmp_path / "crane.fmu", 3)
     text = 'file = "crane.fmu"\ninputs = "push"\nfeatures = "place"\n[parameters]\non = true\nmood = "x"\ngear = 2\n'
     (tmp_path / "crane.toml").write_text(text)
-    parameters = read_mapping(tmp_path / "crane.toml").parameters
+    parameters = read_mapping(FmuMapping, tmp_path / "crane.toml").parameters
     assert {name: value.tolist() for name, value in parameters.items()} == {"on": True, "mood": "x", "gear": 2.0}
 
 
@@ -144,7 +144,7 @@ def test_a_debug_log_stands_beside_the_mapping_and_one_that_cannot_be_written_is
     build_crane(tmp_path / "crane.fmu", 3)
     file = tmp_path / "crane.toml"
     file.write_text('file = "crane.fmu"\ninputs = ["push"]\nfeatures = ["place"]\ndebug_log = "no/such/folder.log"\n')
-    mapping = read_mapping(file)
+    mapping = read_mapping(FmuMapping, file)
     assert mapping.debug_log == tmp_path / "no/such/folder.log"
     with pytest.raises(ValueError, match="debug_log .*folder.log cannot be written: No such file"):
         FmuWorld(mapping, START, 0.05)

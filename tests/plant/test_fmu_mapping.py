@@ -44,7 +44,7 @@ def written(tmp_path, text):
 
 
 def test_every_key_arrives(tmp_path):
-    mapping = read_mapping(written(tmp_path, WHOLE))
+    mapping = read_mapping(FmuMapping, written(tmp_path, WHOLE))
     assert mapping.file == tmp_path / "crane.fmu"
     assert (mapping.inputs, mapping.features, mapping.joints) == (("v[1]", "v[2]"), ("hook",), ("q",))
     assert (mapping.home, mapping.period) == ("q0", 0.01)
@@ -55,7 +55,7 @@ def test_every_key_arrives(tmp_path):
     assert mapping.parameters["mass"] == 12.0
     assert mapping.nominal == {"gains": 3.0}
     assert mapping.start.tolist() == [0.3, 1.2]
-    assert read_mapping(written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
+    assert read_mapping(FmuMapping, written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
 
 
 @pytest.mark.parametrize(
@@ -81,12 +81,12 @@ def test_every_key_arrives(tmp_path):
 def test_a_bad_mapping_is_one_clear_error_that_names_the_file(tmp_path, old, new, message):
     assert old in WHOLE
     with pytest.raises(ValueError, match=f"mapping .*crane.toml.*{message}"):
-        read_mapping(written(tmp_path, WHOLE.replace(old, new, 1)))
+        read_mapping(FmuMapping, written(tmp_path, WHOLE.replace(old, new, 1)))
 
 
 def test_a_missing_mapping_is_told(tmp_path):
     with pytest.raises(ValueError, match=r"mapping .*missing.toml cannot be read"):
-        read_mapping(tmp_path / "missing.toml")
+        read_mapping(FmuMapping, tmp_path / "missing.toml")
 
 
 @pytest.mark.parametrize(("told", "given", "fits"), [("m", "mm", False), ("mm", "m", False), ("m", "m", True),
