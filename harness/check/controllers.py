@@ -214,11 +214,9 @@ class ControllerChecks:
         try:
             knowledge = Rig(n, m).knowledge(truth=self.entry.needs_truth)
             controller = self.entry.build(default_config(self.entry), knowledge)
-        except ConfigurationError as error:
-            if "ValueError" in str(error):
-                return f"it refuses {what}: {error}"
-            raise CheckFailed(f"{error}; this happens with {what}: take n and m from knowledge.spec") from error
         except ValueError as error:
+            if isinstance(error, ConfigurationError) and "ValueError" not in str(error):
+                raise CheckFailed(f"{error}; this happens with {what}: take n and m from knowledge.spec") from error
             return f"it refuses {what}: {error}"
         try:
             Driver(controller, Rig(n, m)).begin().run(min(self.steps, 6))

@@ -69,8 +69,8 @@ class Sensor:
         self._losses, self._lateness = stream("dropped_frames", share), stream("late_frames", share)
         self._outlier_begins, self._occlusion_begins = stream("outliers", share), stream("occlusions", share)
         self._outlier_values = stream("outlier_values", draw_directions, (m,), extents.outlier_size)
-        frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
-        self._frames = frames[0], frames[1]
+        durations = config.outlier_duration, config.occlusion_duration
+        self._outlier_frames, self._occlusion_frames = (max(1, round(each / interval)) for each in durations)
         self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
         self._due: FloatArray = np.zeros(lead)[()]
 
@@ -81,9 +81,8 @@ class Sensor:
             noise = self._noise.next()
             feature = feature + (np.matvec(self._shape, noise) if self._shape.size else noise)
         if config.outliers > 0.0:
-            frames = self._frames[0]
-            begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)
-            self._outlier = self._outlier.next(begins, frames, self._outlier_values.next())
+            begins = self._outlier_begins.next() < begin_probability(config.outliers, self._outlier_frames)
+            self._outlier = self._outlier.next(begins, self._outlier_frames, self._outlier_values.next())
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
         return quantise(feature, self._quantum) if self._quantum > 0.0 else feature
 
@@ -93,9 +92,8 @@ class Sensor:
         if config.drop_probability > 0.0:
             absent = self._losses.next() < config.drop_probability
         if config.occlusions > 0.0:
-            frames = self._frames[1]
-            begins = self._occlusion_begins.next() < begin_probability(config.occlusions, frames)
-            self._occlusion = self._occlusion.next(begins, frames, self._occlusion.value)
+            begins = self._occlusion_begins.next() < begin_probability(config.occlusions, self._occlusion_frames)
+            self._occlusion = self._occlusion.next(begins, self._occlusion_frames, self._occlusion.value)
             absent = self._occlusion.inside if absent is None else np.logical_or(absent, self._occlusion.inside)
         if any(begin <= time + TIME_TOLERANCE < end for begin, end in config.occlusion_windows):
             absent = np.ones_like(self._occlusion.inside)[()]

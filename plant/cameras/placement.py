@@ -189,7 +189,8 @@ def _model(
 ) -> SetupModel:
     work, own = robot.workspace, robot.camera
     home, far = robot.arm.frames(work.home)[-1], work.camera_distance
-    shape = _shape(setup, robot)
+    points, side = np.array(setup.target), None if own is None else own.keys.target.side
+    shape = work.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))  # about its middle
     if mount == "fixed":
         distance = setup.closeness * far
         if own is not None:
@@ -206,13 +207,6 @@ def _model(
                 distance = float((ahead - pose[:3, 3]) @ pose[:3, 2])
         target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
     return SetupModel(arm, setup, mount, cameras, _optics(setup, robot, draws), target, distance, robot.pinhole, far)
-
-
-def _shape(setup: SensingSetup, robot: Robot) -> FloatArray:
-    """Return the points of the target about its middle, (p, 3) m."""
-    side = None if robot.camera is None else robot.camera.keys.target.side
-    points = np.array(setup.target)
-    return robot.workspace.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))
 
 
 def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:

@@ -48,19 +48,6 @@ def take(tree: Tree, lanes: Lanes) -> Tree:
     return map_arrays(lambda array: array[lanes], tree)
 
 
-def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
-    """Return a tree with the indexed lanes taken from `part` and all others from `before`."""
-
-    def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
-        if values is old:
-            return array
-        new = array.copy()
-        new[lanes] = values
-        return new
-
-    return map_arrays(replaced, tree, part, before)
-
-
 def stack(trees: Sequence[Tree]) -> Tree:
     """Return the trees of single runs as one with a leading axis; values other than arrays are those of the first."""
     return map_arrays(lambda *arrays: np.stack(arrays), *trees)
@@ -85,7 +72,15 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
         return function(tree, *arguments)
     lanes = np.nonzero(mask)
     before = take(tree, lanes)
-    return put(tree, lanes, function(before, *(take(each, lanes) for each in arguments)), before)
+
+    def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
+        if values is old:
+            return array
+        new = array.copy()
+        new[lanes] = values
+        return new
+
+    return map_arrays(replaced, tree, function(before, *(take(each, lanes) for each in arguments)), before)
 
 
 def repeat(

@@ -259,8 +259,7 @@ class Check:
 def _checks(kind: type) -> dict[str, Check]:
     """Return the check of each field that is not a section."""
     hints = get_type_hints(kind, include_extras=True)
-    types = {item.name: hints[item.name] for item in fields(kind)}
-    return {key: Check.of(hint) for key, hint in types.items() if not is_dataclass(hint)}
+    return {item.name: Check.of(hints[item.name]) for item in fields(kind) if not is_dataclass(hints[item.name])}
 
 
 @cache

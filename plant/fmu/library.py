@@ -73,7 +73,7 @@ def _load_copy(file: Path) -> ctypes.CDLL:
 
 logger = logging.getLogger("servobench.fmu")
 
-STATUS_WORDS: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
+STATUS_WORDS: Final = dict(enumerate(("ok", "warning", "discard", "error", "fatal", "pending")))
 STATUS_LEVELS: Final = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
 REMEMBERED_MESSAGES: Final = 5
 
@@ -100,9 +100,8 @@ class MessageLog:
         self._last.append(text)
         level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
         logger.log(level, "%s: %s", self._name, text)
-        word = STATUS_WORDS[status] if 0 <= status < len(STATUS_WORDS) else f"status {status}"
         with suppress(OSError):  # No exception may pass through the FMU that calls this.
-            self._append(f"{word}: {text}")
+            self._append(f"{STATUS_WORDS.get(status, f'status {status}')}: {text}")
 
     def _append(self, line: str) -> None:
         """Write a line to the file, if there is one."""
@@ -115,9 +114,7 @@ class MessageLog:
 
         The messages are forgotten.
         """
-        word = outcome
-        if isinstance(outcome, int):
-            word = STATUS_WORDS[outcome] if 0 <= outcome < len(STATUS_WORDS) else "nothing usable"
+        word = STATUS_WORDS.get(outcome, "nothing usable") if isinstance(outcome, int) else outcome
         said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
         self._last.clear()
         return FmuError(f"{self._name}: {function} returned {word}{said}")
