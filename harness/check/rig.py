@@ -5,7 +5,7 @@ import random
 import traceback
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Self
@@ -163,25 +163,18 @@ class Driver:
         return np.array(commands)
 
 
-@dataclass
-class Draws:
-    """Random numbers that came from no seed."""
-
-    places: list[str] = field(default_factory=list)  # where generators without a seed were made
-    shared: list[str] = field(default_factory=list)  # modules whose common generator was used
-
-
 @contextlib.contextmanager
-def watching_draws() -> Iterator[Draws]:
-    """Yield the places and generators of draws without a seed by code of users within the context."""
-    found = Draws()
+def watching_draws() -> Iterator[list[str]]:
+    """Yield a list that gets a sentence on each draw without a seed by code of users within the context."""
+    found: list[str] = []
     source: Any = np.random.bit_generator
     original = source.randbits
 
     def noted(bits: int) -> int:
         for frame in reversed(traceback.extract_stack()):
             if is_users(frame.filename):
-                found.places.append(f"{show(Path(frame.filename))}:{frame.lineno}")
+                place = f"{show(Path(frame.filename))}:{frame.lineno}"
+                found.append(f"{place}: a generator of random numbers is made without a seed")
                 break
         return int(original(bits))
 
@@ -191,7 +184,8 @@ def watching_draws() -> Iterator[Draws]:
         yield found
     finally:
         source.randbits = original
-        found.shared += [name for name, state in _states().items() if state != before[name]]
+        shared = [name for name, state in _states().items() if state != before[name]]
+        found += [f"it draws from the generator of {name}, which no seed of a run sets" for name in shared]
 
 
 def _states() -> dict[str, object]:

@@ -14,7 +14,7 @@ import contextlib
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, final
+from typing import Annotated, Any, Final, final
 
 import numpy as np
 from annotated_types import MinLen
@@ -67,12 +67,6 @@ class ControllerMapping:
     """[1] relative one of the FMU's own solver; None for the solver's own."""
     debug_log: File | None = None
     """A file to which all messages of the FMU are appended, with its debug log turned on; None: it is off."""
-
-
-class FmuControllerState(NamedTuple):
-    """A saved state of an FMU, as bytes."""
-
-    content: bytes
 
 
 @final
@@ -169,7 +163,7 @@ class FmuController(Controller):
         told = self._outputs.values[self._shape[1] :]
         return told.reshape(self._shape).copy() if told.any() else None
 
-    def save(self) -> FmuControllerState:
+    def save(self) -> bytes:
         """Return the state of the FMU.
 
         Raises:
@@ -179,7 +173,7 @@ class FmuController(Controller):
             raise ValueError(
                 f"{self._description.path.name} cannot serialise its state (canSerializeFMUstate is false)"
             )
-        return FmuControllerState(self._instance.save_bytes())
+        return self._instance.save_bytes()
 
     def restore(self, state: object) -> None:
         """Go back to a state that `save` returned.
@@ -188,9 +182,9 @@ class FmuController(Controller):
             TypeError: not such a state.
             FmuError: the FMU does not take it.
         """
-        if not isinstance(state, FmuControllerState):
+        if not isinstance(state, bytes):
             raise TypeError(f"state must come from save, got {type(state).__name__}")
-        self._instance.restore_bytes(state.content)
+        self._instance.restore_bytes(state)
 
 
 def mapped_controller(path: Path, name: str) -> ControllerEntry:

@@ -17,13 +17,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple, Self, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
-from servobench.plant.bench.sensor import Sensor
+from servobench.plant.bench.sensor import TIME_TOLERANCE, Sensor
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.lanes import take
@@ -31,8 +31,6 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import BoolArray, Command, Observation, Truth, trusted_observation
 from servobench.plant.robot.mechanics import RippledJacobian
-
-TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from servobench.plant.contract.seeds import Seeds, Stream
 from servobench.plant.contract.sensing import Extents, SensingConfig, draw_directions, family_of, quantise
 from servobench.plant.contract.signals import BoolArray
 
-TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a window that begins with it
+TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
 
 
 class Sensor:
