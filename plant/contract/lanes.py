@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields, is_dataclass
-from functools import cache, wraps
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -102,27 +102,17 @@ def repeat(
     return tree
 
 
-def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate a function for single runs so that it is called for one lane after the other.
+def lane_by_lane(function: Callable[..., Any], signature: str, *arguments: Any) -> Any:  # noqa: ANN401
+    """Return the results of a function for single runs, which is called for one lane after the other.
 
     Args:
+        function: for single runs.
         signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
+        arguments: of the function, all with the same leading axes, if any.
     """
-    ranks = [len(part.strip("() ").split(",")) if part.strip("() ") else 0
-             for part in signature.split("->", maxsplit=1)[0].replace("),(", ")|(").split("|")]  # fmt: skip
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        over_lanes = np.vectorize(function, signature=signature)
-
-        @wraps(function)
-        def call(*arguments: Any) -> Any:  # noqa: ANN401 - those of the function
-            if all(np.ndim(each) == rank for each, rank in zip(arguments, ranks, strict=True)):
-                return function(*arguments)
-            return over_lanes(*arguments)
-
-        return call
-
-    return decorate
+    if np.ndim(arguments[0]) == signature.partition(")")[0].count(",") + 1:
+        return function(*arguments)
+    return np.vectorize(function, signature=signature)(*arguments)
 
 
 def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:

@@ -252,8 +252,9 @@ class MpcLaw(Law[MpcState]):
 
     def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:
         """Return the best plan within the limits."""
-        solve = lane_by_lane("(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()")(self._solve)
-        return Plan(*(np.asarray(part) for part in solve(plan.moves, J, targets, *bounds)))
+        signature = "(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()"
+        parts = lane_by_lane(self._solve, signature, plan.moves, J, targets, *bounds)
+        return Plan(*map(np.asarray, parts))
 
     def _solve(
         self, moves: FloatArray, J: FloatArray, targets: FloatArray, *bounds: FloatArray
