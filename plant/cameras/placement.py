@@ -117,9 +117,7 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
 
 def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
     """Refuse a user's camera that cannot be that of a set-up."""
-    name, on, off = camera.name, "base", "flange"
-    if mount == "hand":
-        on, off = off, on
+    name, (on, off) = camera.name, ("flange", "base") if mount == "hand" else ("base", "flange")
     if camera.keys.pose.frame == off:
         other = setup.name if mount == "hand" else f"{setup.name}:hand"
         raise ValueError(f"camera {name} is on the {off}; use --sensing {other}")

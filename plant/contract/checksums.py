@@ -47,7 +47,6 @@ def write_vouched(folder: Path, files: Mapping[str, Callable[[Path], object]]) -
 def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
     """Write lines to the end; the beginning of one that a killed process left becomes a line that is not read."""
     lines = "".join(f"{each}  {name}\n" for name, each in digests.items()).encode()
-    created = not (folder / SUMS).exists()
     with (folder / SUMS).open("a+b") as file:
         size = file.seek(0, os.SEEK_END)
         if size:
@@ -56,7 +55,7 @@ def append_sums(folder: Path, digests: Mapping[str, str]) -> None:
         file.write(lines)
         file.flush()
         os.fsync(file.fileno())
-    if created:
+    if not size:  # The file is new.
         sync(folder)
 
 

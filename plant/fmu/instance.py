@@ -194,23 +194,19 @@ class Instance(ABC):
     def access(self, verb: Literal["Get", "Set"], port: Port, row: int = 0) -> RawCall:
         """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
         if all(self.kinds[variable.type] == self.kinds[self.real] for variable in port.members):
-            function = self.function(f"{verb}{self.real}")
-            return partial(function, self._component, *port.variables, *self._row(port, row))
+            place = self._buffer(port.pointer(row), port.values.shape[-1])
+            return partial(self.function(f"{verb}{self.real}"), self._component, *port.variables, *place)
         values = port.values.reshape(-1, port.values.shape[-1])[row]
         parts = np.split(values, np.cumsum([variable.size for variable in port.members])[:-1])
         calls = [self._converted(verb, *each) for each in zip(port.members, parts, strict=True)]
         return lambda: max(call() for call in calls)
 
-    def _row(self, port: Port, row: int) -> tuple[Any, ...]:
-        return self._buffer(port.pointer(row), port.values.shape[-1])
-
     def _converted(self, verb: Literal["Get", "Set"], variable: Variable, values: FloatArray) -> RawCall:
         """Return a function that reads or writes one variable of any numeric type by `values`."""
         word, kind = self.kinds[variable.type]
         buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
-        reference = (ctypes.c_uint32 * 1)(variable.reference)
         place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
-        call = partial(self.function(f"{verb}{word}"), self._component, reference, ctypes.c_size_t(1), *place)
+        call = partial(self.function(f"{verb}{word}"), self._component, *Port([variable]).variables, *place)
 
         def convert() -> int:
             if verb == "Set":
@@ -224,10 +220,9 @@ class Instance(ABC):
 
     def set_texts(self, variables: Sequence[Variable], texts: Sequence[str]) -> None:
         """Give values to variables of text."""
-        references = (ctypes.c_uint32 * len(variables))(*(variable.reference for variable in variables))
         values = (ctypes.c_char_p * len(texts))(*(text.encode() for text in texts))
         place = self._buffer(ctypes.cast(values, ctypes.c_void_p), len(texts))
-        self.call("SetString", references, ctypes.c_size_t(len(variables)), *place)
+        self.call("SetString", *Port(variables).variables, *place)
 
     def configure(self, port: Port) -> None:
         """Set structural parameters, which give the sizes of arrays, before `start`.

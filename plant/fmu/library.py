@@ -1,4 +1,4 @@
-"""The library of an FMU: loading it for this machine, the options of an instance, and its messages and status words."""
+"""The library of an FMU: loading it for this machine, and the messages and status words of its instances."""
 
 import ctypes
 import logging

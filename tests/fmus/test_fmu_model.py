@@ -55,7 +55,8 @@ class Opened:
         columns = []
         for k in range(knowns.values.size):
             knowns.values[:] = np.eye(knowns.values.size)[k]
-            buffers = (*self.instance._row(knowns, 0), *self.instance._row(unknowns, 0))
+            ports = knowns, unknowns
+            buffers = [place for port in ports for place in self.instance._buffer(port.pointer(), port.values.size)]
             places = *unknowns.variables, *knowns.variables, *buffers
             self.instance.call("GetDirectionalDerivative", *places)
             columns.append(unknowns.values.copy())
