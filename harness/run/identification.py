@@ -11,6 +11,7 @@ that directions of θ that no frame tells (the zero of the first joint turns the
 at the nominal robot. The posterior is N(θ, c (JᵀΣ⁻¹J/f + S⁻²)⁻¹), where f is the correlation time of the residuals.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +30,7 @@ from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
 
+LOG: Final = "the log"  # in error messages
 MAX_LATENCY: Final = 0.25  # [s]
 LATENCY_STEP: Final = 0.0125  # [s] of the first search
 MAX_LAG: Final = 0.5  # [s] of commands and joints
@@ -67,30 +69,28 @@ class Log(NamedTuple):
     commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
 
 
-def read_log(spec: PlantSpec, table: pd.DataFrame) -> Log:
+def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
     """Return the rows of a table with columns as `steps.parquet` has them, `spec.period` apart.
 
     Raises:
-        ConfigurationError: a column or a number is missing, or too few frames are valid.
+        ConfigurationError: a column or a number is missing, or fewer than `least` frames are valid.
     """
     names, rows = column_names(spec), np.arange(len(table))
-    joints, features = (numbers_of("the log", table, names[each]) for each in ("joint_position", "feature"))
-    valid = np.ones(len(table), dtype=np.bool_)
-    if "feature_valid" in table:
-        valid = numbers_of("the log", table, ["feature_valid"])[:, 0] != 0.0
-    known = set(names[COMMAND]) <= set(table)
-    commands = numbers_of("the log", table, names[COMMAND]) if known else None
+    joints, features = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
+    given = "feature_valid" in table
+    valid = numbers_of(LOG, table, ["feature_valid"])[:, 0] != 0.0 if given else np.ones(len(rows), dtype=np.bool_)
+    commands = numbers_of(LOG, table, names[COMMAND]) if set(names[COMMAND]) <= set(table) else None
     log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
-    if len(frames := frames_of(log)) < MIN_FRAMES:
-        raise ConfigurationError(
-            f"the log has {len(frames)} valid frames after the first {MAX_LATENCY:g} s; wanted {MIN_FRAMES} or more"
-        )
+    if (count := len(frames_of(log))) < least:
+        after = f"after the first {MAX_LATENCY:g} s"
+        raise ConfigurationError(f"the log has {count} valid frames {after}; wanted {least} or more")
     return log
 
 
-def frames_of(log: Log) -> Any:  # noqa: ANN401 - of indices
-    """Return the rows of frames that were exposed within the log at any latency."""
-    return np.flatnonzero(log.valid & (log.time >= log.time[0] + MAX_LATENCY))
+def frames_of(log: Log, most: int = sys.maxsize) -> Any:  # noqa: ANN401 - of indices
+    """Return the rows of frames that were exposed within the log at any latency: `most` at most, equally spaced."""
+    rows = np.flatnonzero(log.valid & (log.time >= log.time[0] + MAX_LATENCY))
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +166,7 @@ class _Problem:
     """Residuals of the valid frames of a log as a function of z = θ / s."""
 
     def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
-        self.rows = frames_of(log)
-        self.rows = self.rows[:: -(-len(self.rows) // most)]
+        self.rows = frames_of(log, most)
         self.time, self.y = log.time[self.rows], log.features[self.rows]
         self.motion, self.log, self.middle = motion(log), log, float(log.time.mean())
         pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
@@ -191,9 +190,8 @@ class _Problem:
         """Return the median error at a latency and a speed of turning, both, and the pose that fits best."""
         q = self.motion(self.time - latency)
         y = turned(self.y, -turning * (self.time - latency)) if turning else self.y
-        pose = camera_pose(model, q, y)
-        error = np.asarray(model.with_camera(pose).feature(q)) - y
-        return float(np.median(np.linalg.norm(error, axis=1))), float(latency), float(turning), pose.tolist()
+        placed, error = fit_camera(model, q, y)
+        return error, float(latency), float(turning), placed.camera.tolist()
 
     def set(self, **values: float) -> None:
         """Change θ where the search of a fit begins, by name; a name that is no parameter of the log is left out."""
@@ -277,6 +275,12 @@ def played(joints: FloatArray, size: float) -> FloatArray:
     mechanics, x = MechanicsConfig(backlash=size), joints[0]
     behind = np.array([x := mechanics.driven(x, q) for q in joints])
     return behind - joints
+
+
+def fit_camera(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[RobotModel, float]:
+    """Return a model with its camera at `camera_pose`, and the median of its errors there [unit of the feature]."""
+    placed = model.with_camera(camera_pose(model, joints, features))
+    return placed, float(np.median(np.linalg.norm(np.asarray(placed.feature(joints)) - features, axis=1)))
 
 
 def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, camera_pose, frames_of, identify
+from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, fit_camera, frames_of, identify
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -97,8 +97,7 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
     """Return zeros of the joints, by a search along one after the other with the camera where it fits."""
-    rows, draws = frames_of(log), np.random.default_rng(0)
-    rows = rows[:: -(-len(rows) // FRAMES)]
+    rows, draws = frames_of(log, FRAMES), np.random.default_rng(0)
     q, y, n = log.joints[rows], log.features[rows], log.spec.n
     found: list[tuple[float, list[float]]] = []
     for _ in range(SEARCHES):
@@ -107,10 +106,8 @@ def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
             before = best
             for joint, angle in product(range(1, n - 1), ANGLES):  # the first and the last one turn camera and ball
                 other = np.where(np.arange(n) == joint, (zeros + angle) % (2.0 * math.pi), zeros)
-                placed = model.with_camera(camera_pose(model, q + other, y))
-                if (
-                    error := float(np.median(np.linalg.norm(np.asarray(placed.feature(q + other)) - y, axis=1)))
-                ) < best:
+                _, error = fit_camera(model, q + other, y)
+                if error < best:
                     best, zeros = error, other
         found.append((best, ((zeros + math.pi) % (2.0 * math.pi) - math.pi).tolist()))
     return {f"zero_{name}": zero for name, zero in zip(log.spec.joint_names, min(found)[1], strict=True)}
@@ -211,14 +208,11 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
     """
-    rows = frames_of(log)
-    rows = rows[:: -(-len(rows) // FRAMES)]
+    rows = frames_of(log, FRAMES)
     noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
 
     def quick(each: _Remedy) -> float:
-        q, y = each.log.joints[rows], each.log.features[rows]
-        placed = each.model.with_camera(camera_pose(each.model, q, y))
-        return float(np.median(np.linalg.norm(np.asarray(placed.feature(q)) - y, axis=1)))
+        return fit_camera(each.model, each.log.joints[rows], each.log.features[rows])[1]
 
     def misfit(each: _Remedy, begin: Mapping[str, float] | None = None) -> float:
         robot = identify(each.log, each.model, FRAMES, fits=2, begin=begin)
@@ -256,30 +250,27 @@ def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> 
     q, y, names = log.joints, log.features, log.spec.joint_names
     n = len(names)
 
-    def joints(text: str, changed: FloatArray) -> _Remedy:
-        return _Remedy(text, log._replace(joints=changed), model)
+    def changed(text: str, joints: FloatArray = q, features: FloatArray = y) -> _Remedy:
+        return _Remedy(text, log._replace(joints=joints, features=features), model)
 
     for i, j in combinations(range(n), 2):
         order = np.arange(n)
         order[[i, j]] = j, i
-        yield joints(f"joints {names[i]} and {names[j]} are exchanged", q[:, order])
+        yield changed(f"joints {names[i]} and {names[j]} are exchanged", joints=q[:, order])
     alphabetical = np.argsort(np.argsort(names))
-    yield joints("joints are in alphabetical order, as in ROS", q[:, alphabetical])
-    yield joints("joints are in reverse order", q[:, ::-1])
+    yield changed("joints are in alphabetical order, as in ROS", joints=q[:, alphabetical])
+    yield changed("joints are in reverse order", joints=q[:, ::-1])
     for i, name in enumerate(names):
-        yield joints(f"the direction of joint {name} is reversed", q * np.where(np.arange(n) == i, -1.0, 1.0))
+        sign = np.where(np.arange(n) == i, -1.0, 1.0)
+        yield changed(f"the direction of joint {name} is reversed", joints=q * sign)
         for turn in (90, -90, 180):
             offset = np.where(np.arange(n) == i, math.radians(turn), 0.0)
-            yield joints(f"the zero of joint {name} is {turn}° off", q + offset)
+            yield changed(f"the zero of joint {name} is {turn}° off", joints=q + offset)
     if log.spec.feature.unit == "m":
-        yield _Remedy(
-            "an axis of the camera is mirrored, or two are exchanged", log._replace(features=y * (1, 1, -1)), model
-        )
+        yield changed("an axis of the camera is mirrored, or two are exchanged", features=y * (1, 1, -1))
     else:
         size = 2.0 * np.median(y, axis=0)
-        yield _Remedy(
-            "an axis of the image is mirrored", log._replace(features=(size - y) * (1, 0) + y * (0, 1)), model
-        )
-        yield _Remedy("u and v are exchanged", log._replace(features=y[:, ::-1]), model)
+        yield changed("an axis of the image is mirrored", features=(size - y) * (1, 0) + y * (0, 1))
+        yield changed("u and v are exchanged", features=y[:, ::-1])
     for name, other in others.items():
         yield _Remedy(f"the arm is a {name}", log, other)

@@ -19,6 +19,7 @@ import pandas as pd
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
+from servobench.harness.run.identification import LOG, read_log
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import LoopSettings, careful, run_loop
 from servobench.harness.run.resolution import ResolvedRun
@@ -30,7 +31,6 @@ from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND, Command, Observation, PlantSpec, Truth, column_names
 from servobench.plant.robot.hand_eye import RobotModel
 
-LOG: Final = "the log"  # in error messages
 LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 PREDICTED: Final = "predicted_"  # before the name of a column of features
 DELAY: Final = "delay"  # diagnostic of controllers that identify the camera's delay [s]
@@ -62,17 +62,13 @@ class LoggedPlant(Plant):
         Raises:
             ConfigurationError: a column or a number is missing.
         """
-        self.spec, self._k = spec, 0
-        names = column_names(spec)
-        given = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature", "reference"))
-        self.joints, self._features, self.reference = given
-        valid = numbers_of(LOG, table, ["feature_valid"]) if "feature_valid" in table else np.ones((len(table), 1))
-        self._valid = valid[:, 0] != 0.0
-        if not self._valid.any():
+        self.spec, self.log, self._k = spec, read_log(spec, table, least=0), 0
+        self.reference = numbers_of(LOG, table, column_names(spec)["reference"])
+        if not self.log.valid.any():
             raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
-        true = names["true_feature"]
+        true = column_names(spec)["true_feature"]
         known = set(true) <= set(table)
-        self._true = table[true].to_numpy(np.float64) if known else np.full_like(self._features, np.nan)
+        self._true = table[true].to_numpy(np.float64) if known else np.full_like(self.log.features, np.nan)
 
     def check_units(self, model: RobotModel | None) -> None:
         """Refuse joints and features that no robot of this kind has, and remark on features that move otherwise.
@@ -83,7 +79,7 @@ class LoggedPlant(Plant):
         Raises:
             ConfigurationError: names the row, and the unit in which the log has to be.
         """
-        spec, q = self.spec, self.joints
+        spec, q = self.spec, self.log.joints
         beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
         row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
         where = (
@@ -94,20 +90,20 @@ class LoggedPlant(Plant):
             raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
         if beyond.max() > MAX_EXCESS:
             remark(where)
-        for kind, values in (("feature", self._features), ("reference", self.reference)):
+        for kind, values in (("feature", self.log.features), ("reference", self.reference)):
             sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
             far, size = int(sizes.argmax()), float(sizes.max())
             if unit in ("m", "px") and size > MAX_FEATURE * spec.feature.scale:
                 where = f"row {far} of the log has a {kind} of {size:g} {unit}, beyond any camera"
                 raise ConfigurationError(where + "; if the log is in mm, write it in m" * (unit == "m"))
-        if model is not None and self._valid[MAX_LATE:].any():
+        if model is not None and self.log.valid[MAX_LATE:].any():
             self._check_motion(model)
 
     def _check_motion(self, model: RobotModel) -> None:
         """Remark on features that are no late image of a model's at these joints: turned, or affine of pixels."""
-        y, p = (each / self.spec.feature.scale for each in (self._features, model.feature(self.joints)))
+        y, p = (each / self.spec.feature.scale for each in (self.log.features, model.feature(self.log.joints)))
         rows = len(y) - np.arange(min(MAX_LATE, len(y) // 2))
-        valid, unit = self._valid, self.spec.feature.unit
+        valid, unit = self.log.valid, self.spec.feature.unit
         apart, mirrored = min(_apart(y[-k:][valid[-k:]], p[:k][valid[-k:]], unit) for k in rows)
         if apart > MAX_SHARE_APART.get(unit, MAX_SHARE_APART["px"]):
             remark(
@@ -124,12 +120,12 @@ class LoggedPlant(Plant):
 
     def step(self, command: Command) -> Observation:
         """Return the next row; the command is ignored. See `Plant.step`."""
-        self._k = min(self._k + 1, len(self.joints) - 1)
+        self._k = min(self._k + 1, len(self.reference) - 1)
         return self._row()
 
     def _row(self) -> Observation:
-        k = self._k
-        return Observation(k * self.spec.period, self.joints[k], self._features[k], bool(self._valid[k]))
+        k, log = self._k, self.log
+        return Observation(k * self.spec.period, log.joints[k], log.features[k], bool(log.valid[k]))
 
     def truth(self) -> Truth:
         """Return the true feature of the log, NaN where it has none."""
@@ -173,17 +169,17 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     finally:
         experiment.plant.close()
     rows = log.steps()
-    steps, names = rows.table(request.run_id), column_names(spec)[COMMAND]
+    steps = rows.table(request.run_id)
     if not np.isnan(ahead := predicted(rows)).all():
         steps[[PREDICTED + name for name in column_names(spec)["feature"]]] = ahead
         _check_delay(rows, ahead)
-    if set(names) <= set(table):
-        steps[[LOGGED + name for name in names]] = commands = numbers_of(LOG, table, names)
+    if (commands := plant.log.commands) is not None:
+        steps[[LOGGED + name for name in column_names(spec)[COMMAND]]] = commands
         if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
             remark(
                 f"commands of the log reach {np.abs(commands).max():g} rad/s; if they are in deg/s, write them in rad/s"
             )
-        if np.allclose(commands, plant.joints, atol=MAX_EXCESS):
+        if np.allclose(commands, plant.log.joints, atol=MAX_EXCESS):
             remark("commands of the log are its joint positions, and wanted are velocities")
     return steps
 

@@ -68,9 +68,8 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
             f"delay and lag leave {response.unexplained:.0%} of the joint motion: the drive is no first-order lag"
         )
     for section, settings in sensor(log, robot).settings.items():
-        lines.append(
-            f"settings of a plant: {', '.join(f'{section}.{name}={value:.3g}' for name, value in settings.items())}"
-        )
+        words = ", ".join(f"{section}.{name}={value:.3g}" for name, value in settings.items())
+        lines.append(f"settings of a plant: {words}")
     if far := robot.unlikely():
         lines.append(f"far from the nominal robot: {', '.join(far)}; is it this arm?")
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
