@@ -18,19 +18,12 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
+from servobench.harness.run.knowledge import in_view, network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.request import (
-    DEFAULT_ROBOT,
-    RunRequest,
-    RunSettings,
-    find_robot,
-    find_sensing,
-    sensing_file,
-)
+from servobench.harness.run.request import RunRequest, RunSettings, find_robot, find_sensing, sensing_file
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
-from servobench.harness.run.scenario import Scenario, TaskSetting
+from servobench.harness.run.scenario import Scenario, TaskSetting, Vector
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.bench.plant import Plant, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
@@ -170,7 +163,7 @@ class Experiment:
         run, periods = self.run, self.periods
         moved = [each.moved.camera for each in self.runs if each.moved is not None]
         move = CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
-        return LoopSettings(periods, run.preview_rows, run.lost_after_periods, move)
+        return LoopSettings(periods, run.preview_rows, run.periods(run.lost_after), move)
 
     def desired(self, periods: int | None = None) -> FloatArray:
         """Return the desired features of the run, or of so many periods, and beyond them those that are previewed.
@@ -205,14 +198,11 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
         drawn = draw(resolved)
         plant, controller, networks = _assemble(resolved, drawn.true, drawn.scenario.start, progress)
         return Experiment(plant, controller, (drawn,), resolved.run, networks)
+    brings = f"plant {request.plant} brings a"
     if request.mismatch != Mismatch():
-        raise ConfigurationError(
-            f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
-        )
+        raise ConfigurationError(f"{brings} robot of its own, to which mismatches do not apply; use --mismatch none")
     if request.sensing != DEFAULT_SENSING:
-        raise ConfigurationError(
-            f"plant {request.plant} brings a sensor of its own, so --sensing {request.sensing} does not apply"
-        )
+        raise ConfigurationError(f"{brings} sensor of its own, so --sensing {request.sensing} does not apply")
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
         setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
@@ -254,14 +244,13 @@ def _assemble(
         plant = entry.build(resolved.plant, setup)
     try:
         if robot is None:
-            knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
-            trained = None if knowledge.nominal_jacobian is None else knowledge
+            trained = knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
         else:
             nominal = find_sensing(request.sensing).nominal(robot)
             knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
-            trained = in_view(knowledge, nominal, robot) if robot.known else None
-        source = None if trained is None else trained_on(trained, progress)
-        true_model = plant.true_model if robot is None else lambda: plant.with_delays(_equations(true))
+            trained = in_view(knowledge, nominal, robot)
+        source = network_source(trained, progress)
+        true_model = plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
         knowledge = replace(knowledge, train=source)
         controller = _build_controller(request.controller, resolved.controller, knowledge, true_model)
     except BaseException:
@@ -320,11 +309,7 @@ def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
 
 
 def train_networks(
-    controller: str,
-    settings: Settings,
-    progress: Progress,
-    robot_name: str = DEFAULT_ROBOT,
-    sensing: str = DEFAULT_SENSING,
+    controller: str, settings: Settings, progress: Progress, robot_name: str, sensing: str = DEFAULT_SENSING
 ) -> TrainedNetworks:
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 
@@ -342,10 +327,7 @@ def train_networks(
     return experiment.networks[-1]
 
 
-def _equations(model: RobotModel | None) -> TrueModel:
-    if model is None:
-        raise ValueError("model must be given for a controller that needs the truth, got None")
-
+def _equations(model: RobotModel) -> TrueModel:
     def symbolic(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
         from servobench.plant.cameras.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
 
@@ -378,23 +360,21 @@ def _build_controller(
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
     """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
-    times = {"run.period": resolved.run.period}
+    times, whole = {"run.period": resolved.run.period}, f"the run of {duration:g} s"
     times |= {f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")}
     if isinstance(sensing, SensingConfig):
         names = ("latency", "jitter", "frame_period", "latency_swing")
         times |= {f"{plant}.sensing.{name}": getattr(sensing, name) for name in names}
         if late := [begin for begin, _ in sensing.occlusion_windows if begin >= duration]:
             where = f"{plant}.sensing.occlusion_windows"
-            raise ConfigurationError(f"{where} must begin within the run of {duration:g} s, got {late[0]:g} s")
+            raise ConfigurationError(f"{where} must begin within {whole}, got {late[0]:g} s")
     for name, time in times.items():
         if isinstance(time, float) and time > 0.0 and time >= duration:
             meant = likely_meant(time, "s", lambda other: other < duration)
-            raise ConfigurationError(f"{name} must be shorter than the run of {duration:g} s, got {time:g} s{meant}")
+            raise ConfigurationError(f"{name} must be shorter than {whole}, got {time:g} s{meant}")
     preview = resolved.run.preview_time
     if preview > max(duration, RunSettings().preview_time):
-        raise ConfigurationError(
-            f"run.preview_time must be no longer than the run of {duration:g} s, got {preview:g} s"
-        )
+        raise ConfigurationError(f"run.preview_time must be no longer than {whole}, got {preview:g} s")
 
 
 def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
@@ -453,9 +433,8 @@ def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) ->
     for what, values in (("start", scenario.start), ("target", resolved.task.taught_at)):
         if values is None:
             continue
-        for joint, value, lower, upper in zip(
-            spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True
-        ):
+        rows = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
+        for joint, value, lower, upper in rows:
             if not lower <= value <= upper:
                 raise ConfigurationError(
                     f"task {resolved.request.task}: {what} must be within the joints' limits, {lower:.4g} to "
@@ -464,9 +443,7 @@ def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) ->
 
 
 @lru_cache(maxsize=64)
-def _distances(
-    nominal: HandEyeModel, points: tuple[tuple[float, ...], ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> tuple[float, ...]:
+def _distances(nominal: HandEyeModel, points: tuple[Vector, ...], lower: Vector, upper: Vector) -> Vector:
     """Return how near the nominal arm comes to each point [m]."""
     found = closest_distance(nominal.arm, nominal.to_base(np.array(points)), np.array(lower), np.array(upper))
     return tuple(found.tolist())

@@ -28,17 +28,13 @@ def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: R
     """Return the knowledge that every controller gets."""
     if not robot.known:
         return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
-    return RobotKnowledge(
-        spec=spec,
-        preview=run.preview_rows,
-        nominal_jacobian=nominal.jacobian,
-        region=(robot.workspace.lower, robot.workspace.upper),
-    )
+    region = robot.workspace.lower, robot.workspace.upper
+    return RobotKnowledge(spec, run.preview_rows, nominal.jacobian, region=region)
 
 
 def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:
     """Return the knowledge for training networks: its Jacobian covers postures with the target in view only."""
-    if nominal is robot.nominal:
+    if nominal is robot.nominal or not robot.known:
         return knowledge
     return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
 
@@ -73,12 +69,11 @@ class NetworkSource:
         return _KEPT[key]
 
 
-def trained_on(knowledge: RobotKnowledge, progress: Progress | None) -> NetworkSource:
-    """Return where a controller that knows a nominal model gets networks that are trained on it, in natural units."""
+def network_source(knowledge: RobotKnowledge, progress: Progress | None) -> NetworkSource | None:
+    """Return the source of networks that are trained on a nominal model, in natural units; None where none is known."""
     natural = in_natural_units(knowledge)
-    if natural.nominal_jacobian is None:
-        raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
-    return NetworkSource(natural.nominal_jacobian, natural.spec, progress)
+    J = natural.nominal_jacobian
+    return None if J is None else NetworkSource(J, natural.spec, progress)
 
 
 def keep_networks(networks: Iterable[TrainedNetworks], folder: Path) -> None:

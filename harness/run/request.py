@@ -76,13 +76,8 @@ class RunSettings:
         """Future rows of the reference that every controller gets."""
         return self._whole_periods(self.preview_time)
 
-    @property
-    def lost_after_periods(self) -> int:
-        """Control periods in a row without a valid feature after which a run ends."""
-        return self.periods(self.lost_after)
-
     def periods(self, duration: float) -> int:
-        """Return how many control periods a run of `duration` [s] has."""
+        """Return how many control periods a run or a part of `duration` [s] has."""
         return max(1, self._whole_periods(duration))
 
     def _whole_periods(self, time: float) -> int:
@@ -164,14 +159,11 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        mismatch, plant, controller, task = (
-            _fit_for_files(str(name)) for name in (self.mismatch, self.plant, self.controller, self.task)
-        )
-        varied = "".join(map(_in_name, self.varied)) if self.varied else ""
-        name = short_name(self.robot).replace(WITH, "+")
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{_fit_for_files(name)}-"
-        sensing = "" if self.sensing == DEFAULT_SENSING else f"{_fit_for_files(Path(self.sensing).name)}-"
-        return f"{plant}-{robot}{sensing}{controller}-{task}-{mismatch}{varied}-{self.seed}"
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{short_name(self.robot).replace(WITH, '+')}-"
+        sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
+        varied = "".join(map(_in_name, self.varied))
+        name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
+        return UNFIT_FOR_FILES.sub("_", name)
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs.
@@ -190,11 +182,9 @@ def varied_in_row(row: Mapping[str, Any]) -> Varied:
     """Return the settings that a run varies, by key, from its row in a table of runs."""
     usual = {short.column: short.usual for short in SHORT_NAMES.values()}
     columns = {short.column: short.key for short in SHORT_NAMES.values()} | {key: key for key in row if "." in key}
-    values = {name: row[name] for name in columns if row.get(name) not in (None, usual.get(name))}
-    given = [
-        (columns[name], json.loads(value) if str(value).startswith("[") else value) for name, value in values.items()
-    ]
-    return tuple((key, value) for key, value in given if not (isinstance(value, float) and math.isnan(value)))
+    values = {key: row[name] for name, key in columns.items() if row.get(name) not in (None, usual.get(name))}
+    given = {key: json.loads(value) if str(value).startswith("[") else value for key, value in values.items()}
+    return tuple((key, value) for key, value in given.items() if not (isinstance(value, float) and math.isnan(value)))
 
 
 def varied_columns(columns: Iterable[str]) -> dict[str, tuple[str, float]]:
@@ -214,15 +204,11 @@ def _in_name(varied: tuple[str, Value]) -> str:
     for name, short in SHORT_NAMES.items():
         if short.key == key and isinstance(value, int | float):
             return "" if value == short.usual else f"-{name}{short.scale * value:g}{short.unit}"
-    return f"-{_fit_for_files(f'{key}={value}')}"
+    return f"-{key}={value}"
 
 
 def _frozen(value: Value | list[Value]) -> Value:
     return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
-
-
-def _fit_for_files(text: str) -> str:
-    return UNFIT_FOR_FILES.sub("_", text)
 
 
 def read_mismatch(text: str) -> Mismatch:

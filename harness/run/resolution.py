@@ -14,7 +14,7 @@ from servobench.harness.config.registry import (
     plant_names,
 )
 from servobench.harness.config.settings import Settings, default_config, flatten, nest
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied, find_robot
+from servobench.harness.run.request import DEFAULT_ROBOT, ROLES, RunRequest, RunSettings, Varied, find_robot
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
@@ -78,7 +78,6 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     Raises:
         ConfigurationError: an unknown name, or a setting that cannot be used.
     """
-    defaults: dict[str, Any] = {"run": RunSettings()}
     requests = list(requests)
     for request in requests:
         for name, what in ((request.plant, "plant"), (request.controller, "controller")):
@@ -88,14 +87,11 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
             raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
     robot, period = _common_robot(requests), settings.resolve("run", RunSettings()).period
     find = installed_plant if to_run else find_plant
-    defaults |= {
-        name: _plant_default(find(name), robot, period) for name in dict.fromkeys(each.plant for each in requests)
-    }
-    defaults |= {
-        name: default_config(find_controller(name), model_known=robot.known)
-        for name in dict.fromkeys(each.controller for each in requests)
-    }
-    defaults |= {name: fitted(name, robot) for name in dict.fromkeys(each.task for each in requests)}
+    plants, controllers, tasks = (dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES)
+    defaults: dict[str, Any] = {"run": RunSettings()}
+    defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
+    defaults |= {name: default_config(find_controller(name), model_known=robot.known) for name in controllers}
+    defaults |= {name: fitted(name, robot) for name in tasks}
     return Sections({name: settings.resolve(name, default) for name, default in defaults.items()})
 
 
