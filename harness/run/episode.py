@@ -22,9 +22,10 @@ from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.outcome import final_means, find_outcome, pose_errors
 from servobench.harness.run.request import OWN_ROBOT, RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
-from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
+from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
 
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
 
@@ -56,7 +57,7 @@ def carry_out(
             pair = held_to_contract(plant, experiment.controller)
             run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
     except BaseException as error:
-        if ends_batch(error) or (debug and is_defect(error)):
+        if ends_batch(error) or (debug and not isinstance(error, RunFault)):
             raise
         ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
     finally:
@@ -96,9 +97,8 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     try:
         with careful(), contextlib.suppress(AllEnded):
             servo = ManyServos(cast(ServoController, many.controller).servo, ends)
-            run_loop(
-                ManyBenches(bench, ends), servo, many.desired(), many.loop, [each.request.seed for each in runs], log
-            )
+            seeds = [each.request.seed for each in runs]
+            run_loop(ManyBenches(bench, ends), servo, many.desired(), many.loop, seeds, log)
     finally:
         bench.close()
     if keep is not None:
@@ -111,7 +111,7 @@ def _judge_together(runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, l
     columns = {name: values.tolist() for name, values in metrics.items()}
     results = []
     for lane, (run, drawn) in enumerate(zip(runs, many.runs, strict=True)):
-        own = logged.run(lane, ends.rows.get(lane, len(logged)))
+        own = logged.first(ends.rows.get(lane, len(logged)), lane)
         if lane in ends.faults:
             ending, values = Ending.of(ends.faults[lane]), _judge(own, many)
         else:

@@ -20,7 +20,7 @@ from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import Tree, map_arrays, take
+from servobench.plant.contract.lanes import Lanes, Tree, map_arrays, take
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 LaneIndex = npt.NDArray[np.intp]
@@ -179,22 +179,22 @@ def failing_lanes(
     servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
 ) -> list[tuple[int, Exception]]:
     """Return the lanes in which a step fails, each with its error as a single run, by halving."""
+    error = _error_of_step(servo, state, given, lanes)
+    if error is None:
+        return []
+    if len(lanes) == 1:
+        lane = int(lanes[0])
+        return [(lane, _error_of_step(servo, state, given, lane) or error)]  # with the words of a single run
+    half = len(lanes) // 2
+    return [*failing_lanes(servo, state, given, lanes[:half]), *failing_lanes(servo, state, given, lanes[half:])]
+
+
+def _error_of_step(servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: Lanes) -> Exception | None:
     try:
         servo.step(take(state, lanes), *take(given, lanes))
     except Exception as error:  # noqa: BLE001 - a part may raise anything
-        if len(lanes) == 1:
-            return [(int(lanes[0]), _as_single_run(servo, state, given, int(lanes[0]), error))]
-        half = len(lanes) // 2
-        return [*failing_lanes(servo, state, given, lanes[:half]), *failing_lanes(servo, state, given, lanes[half:])]
-    return []
-
-
-def _as_single_run(servo: Servo, state: ServoState, given: tuple[Any, ...], lane: int, error: Exception) -> Exception:
-    try:
-        servo.step(take(state, lane), *take(given, lane))
-    except Exception as own:  # noqa: BLE001 - the same error with the words of a single run
-        return own
-    return error
+        return error
+    return None
 
 
 @final

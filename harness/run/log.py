@@ -46,11 +46,12 @@ class Steps:
         """Number of rows."""
         return len(self.time)
 
-    def run(self, lane: int, rows: int) -> Steps:
-        """Return the first rows of one of the runs side by side."""
-        named = ((item.name, getattr(self, item.name)) for item in fields(self)[1:-1])
-        arrays = {name: array[:rows] if array.ndim == 1 else array[:rows, lane] for name, array in named}
-        return Steps(self.spec, **arrays, diagnostics={})
+    def first(self, rows: int, lane: int | None = None) -> Steps:
+        """Return the first rows, of all runs or of one of those side by side."""
+        arrays = {item.name: getattr(self, item.name)[:rows] for item in fields(self)[1:-1]}
+        if lane is not None:
+            arrays = {name: array if array.ndim == 1 else array[:, lane] for name, array in arrays.items()}
+        return Steps(self.spec, **arrays, diagnostics={name: all_[:rows] for name, all_ in self.diagnostics.items()})
 
     def error_norm(self) -> FloatArray:
         """Return ‖reference − true feature‖, (k, ...) [unit of the feature]."""
@@ -176,9 +177,7 @@ class StepLog:
 
     def steps(self) -> Steps:
         """Return the rows so far."""
-        k, rows = self._count, self._rows
-        arrays = {item.name: getattr(rows, item.name)[:k] for item in fields(rows)[1:-1]}
-        return Steps(rows.spec, **arrays, diagnostics={name: values[:k] for name, values in rows.diagnostics.items()})
+        return self._rows.first(self._count)
 
 
 def flat(values: FloatArray) -> FloatArray:

@@ -89,11 +89,6 @@ class RunResult:
         return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
 
 
-def is_defect(error: BaseException) -> bool:
-    """Return whether an error is a defect of code, and no fault that a run may end with."""
-    return not isinstance(error, RunFault)
-
-
 def ends_batch(error: BaseException) -> bool:
     """Return whether an error is Ctrl-C; no Ctrl-C reaches a worker process, where code of users raised it itself."""
     return isinstance(error, KeyboardInterrupt) and parent_process() is None
@@ -136,7 +131,7 @@ def _place(error: BaseException) -> _Place | None:
         return _beginning(error.method)
     frames = list(traceback.walk_tb(error.__traceback__))
     own = [(frame, line) for frame, line in frames if is_users(frame.f_code.co_filename)]
-    if not own and is_defect(error):
+    if not own and not isinstance(error, RunFault):
         ours = [each for each in frames if Path(each[0].f_code.co_filename).is_relative_to(PACKAGE_FOLDER)]
         own = [each for each in ours if each[0].f_globals.get("__name__") != ConfigurationError.__module__]
     if not own:
