@@ -4,6 +4,7 @@ The step of a controller is recorded, and a run of it is kept inside the FMU for
 """
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from typing import Any, Final
@@ -57,10 +58,8 @@ def controller_model(request: RunRequest, settings: Settings) -> ControllerModel
         raise ConfigurationError(f"controller {entry.name!r} cannot be exported: it is given the true robot")
     resolved = resolve(request, settings)
     experiment = build(resolved)
-    try:
+    with closing(experiment.plant):
         return _model(entry, resolved, experiment)
-    finally:
-        experiment.plant.close()
 
 
 def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment) -> ControllerModel:
@@ -78,11 +77,10 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
         REFERENCE: ((rows, spec.m), "f"),
     }
     try:
-        recorded = record(controller.servo, _start, _step, shapes)
+        recorded = record(controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes)
     except NotTraceable as error:
-        where = f" with --sensing {resolved.request.sensing}, but perhaps with another" * (
-            resolved.request.sensing != DEFAULT_SENSING
-        )
+        sensing = resolved.request.sensing
+        where = "" if sensing == DEFAULT_SENSING else f" with --sensing {sensing}, but perhaps with another"
         raise ConfigurationError(f"controller {entry.name!r} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)
@@ -120,10 +118,6 @@ def _observation(inputs: Mapping[str, Any]) -> Observation:
     return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
 
 
-def _start(servo: Servo, inputs: Mapping[str, Any]) -> ServoState:
-    return servo.start(_observation(inputs))
-
-
 def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[ServoState, FloatArray]:
     """Return the new state, and command and Jacobian in one row."""
     state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
@@ -145,12 +139,8 @@ def _run(experiment: Experiment) -> ReferenceRun:
     try:
         for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
             observation, estimate = period.observation, controller.estimated_jacobian()
-            rows = (
-                observation.joint_position,
-                observation.feature,
-                observation.valid.astype(np.float64),
-                period.reference,
-            )
+            valid = observation.valid.astype(np.float64)
+            rows = observation.joint_position, observation.feature, valid, period.reference
             inputs.append([observation.time, *(np.ravel(row) for row in rows)])
             outputs.append([period.command.joint_velocity, unknown if estimate is None else np.ravel(estimate)])
     except RunFault as fault:

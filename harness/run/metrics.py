@@ -50,9 +50,8 @@ class Judged:
         self.steps, self.fixed, self.period = steps, kind == "point_to_point", steps.spec.period
         self.error = _columns(steps.error_norm())
         self.feature, self.reference, self.command = map(_columns, (steps.true_feature, steps.reference, steps.command))
-        judged_from, second, third = np.searchsorted(
-            steps.time, [evaluate_from - 1e-9, lap_time - 1e-9, 2.0 * lap_time - 1e-9]
-        )
+        begins = np.array([evaluate_from, lap_time, 2.0 * lap_time])
+        judged_from, second, third = np.searchsorted(steps.time, begins - 1e-9)
         self.evaluated, self.second_lap = self.error[..., judged_from:], self.error[..., second:third]
         self.acceleration = np.diff(self.command, axis=-1) / self.period  # without the step from rest
         self.jerk = np.diff(self.acceleration, axis=-1) / self.period

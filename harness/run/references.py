@@ -137,11 +137,11 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         return Waypoints(values[:, 0], values[:, 1:])
 
 
+@dataclass(frozen=True, eq=False)
 class ImageReference(Reference):
     """A desired place of the target over time, and its image."""
 
-    model: SetupModel
-    """The true arm and its cameras."""
+    model: SetupModel  # the true arm and its cameras
 
     @abstractmethod
     def points(self, time: npt.ArrayLike) -> FloatArray:
@@ -157,7 +157,6 @@ class ImageReference(Reference):
 class TaughtImage(ImageReference):
     """The target where it is with the arm at given joint positions."""
 
-    model: SetupModel
     joint_position: FloatArray  # (n,) [rad]
 
     def points(self, time: npt.ArrayLike) -> FloatArray:
@@ -171,7 +170,6 @@ class TaughtImage(ImageReference):
 class FollowedCurve(ImageReference):
     """The target on a curve in space, as above."""
 
-    model: SetupModel
     curve: Reference  # of a ball in the frame of a fixed camera, (3,) [m]
     robot: Robot  # whose home gives the orientation, and whose workspace the curve is in
 

@@ -69,11 +69,9 @@ class TaskSetting:
             ValueError: the plant brings a robot of its own.
         """
         model = self.taught_on()[1]
-        return (
-            TaughtImage(model, joint_position)
-            if isinstance(model, SetupModel)
-            else FixedPoint(model.feature(joint_position))
-        )
+        if isinstance(model, SetupModel):
+            return TaughtImage(model, joint_position)
+        return FixedPoint(model.feature(joint_position))
 
     def taught_on(self) -> tuple[Robot, RobotModel]:
         """Return the robot and the true one, for a target that is taught on it.
@@ -124,7 +122,6 @@ class Task(ABC):
             name: of the task.
             work: the workspace of the robot.
         """
-        del name
         given = {each: getattr(self, each) for each in self.places if each != "start"}
         points = {each: tuple(work.scale * value for value in point) for each, point in given.items()}
         home = {"start": numbers(work.home)} if "start" in self.places else {}

@@ -139,7 +139,6 @@ class RandomTask(Task):
 
     def scaled(self, name: str, work: Workspace) -> Self:
         """See `Task.scaled`."""
-        del name
         lower, upper = numbers(work.lower), numbers(work.upper)
         shortest, lowest = work.scale * self.shortest, work.scale * self.lowest
         return replace(self, lower=lower, upper=upper, shortest=shortest, lowest=lowest)
