@@ -315,17 +315,13 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
     positional = [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
     needed = [each for each in positional if each.default is each.empty]
     only_by_name = [each for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
-    where = f"{_class_place(kind)}: {kind.__name__}"
+    must = f"{_class_place(kind)}: {kind.__name__}.__init__ must"
     if len(needed) > 2 or only_by_name or not parameters:
         got = ", ".join(["self", *(each.name for each in parameters)])
-        raise ConfigurationError(
-            f"{where}.__init__ must take (self, {argument}) or (self, config, {argument}), got ({got})"
-        )
+        raise ConfigurationError(f"{must} take (self, {argument}) or (self, config, {argument}), got ({got})")
     if len(needed) < 2:
         return None
-    wanted = (
-        f"{where}.__init__ must name the dataclass of its settings, such as {needed[0].name}: {kind.__name__}Config"
-    )
+    wanted = f"{must} name the dataclass of its settings, such as {needed[0].name}: {kind.__name__}Config"
     try:
         config = get_type_hints(kind.__init__).get(needed[0].name)
     except Exception as error:  # annotations are code of the user

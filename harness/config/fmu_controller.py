@@ -208,11 +208,7 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
 
 
 def _conventional(path: Path) -> ControllerMapping:
-    """Return the mapping of an FMU with the names of exported controllers; `seen` and `jacobian` may be missing.
-
-    Raises:
-        ValueError: not an FMU, or without such names.
-    """
+    """Return the mapping of an FMU with the names of exported controllers; `seen` and `jacobian` may be missing."""
     description = read_description(path, extract_fmu(path))
     names: dict[str, Any] = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
     lacking = [CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names]

@@ -60,19 +60,15 @@ class SourceFile:
         """SHA-256 of the text."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
-    @property
-    def module_name(self) -> str:
-        """Name of the module, the same in every process; other files and other texts have other names."""
-        place = hashlib.sha256(f"{self.path}\n{self.digest}".encode()).hexdigest()[:12]
-        return f"servobench_file_{self.path.stem}_{place}"
-
     def load(self) -> ModuleType:
         """Carry out the file, once in a process, and return its module; files beside it can be imported.
 
         Raises:
             ConfigurationError: it cannot be executed; one line with file and line number.
         """
-        name = self.module_name
+        # The same name in every process; other files and other texts have others.
+        place = hashlib.sha256(f"{self.path}\n{self.digest}".encode()).hexdigest()[:12]
+        name = f"servobench_file_{self.path.stem}_{place}"
         if name in sys.modules:
             return sys.modules[name]
         make_importable(self.path.parent)
@@ -93,9 +89,6 @@ class SourceFile:
         """Refuse an import of a file beside this one if another module of that name would be taken.
 
         A process has one module of a name: the `helper.py` of a second folder would silently be that of the first.
-
-        Raises:
-            ConfigurationError: names the import and both files.
         """
         importlib.invalidate_caches()
         for file, line, (name, *_) in traced_imports(self.path, self.path.parent):

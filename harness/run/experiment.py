@@ -231,9 +231,6 @@ def _assemble(
 
     For None the plant brings its own. Of runs side by side the arrays of the robot have a leading axis, and `resolved`
     is one of them.
-
-    Raises:
-        ConfigurationError: a setting that cannot be used.
     """
     request, run, entry = resolved.request, resolved.run, find_plant(resolved.request.plant)
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:

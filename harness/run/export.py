@@ -28,6 +28,7 @@ from servobench.fmus.product import Product
 from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
+from servobench.fmus.variables import INPUT
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
@@ -63,37 +64,30 @@ def controller_model(request: RunRequest, settings: Settings) -> ControllerModel
 
 
 def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment) -> ControllerModel:
-    controller, spec = experiment.controller, experiment.plant.spec
+    controller, spec, name = experiment.controller, experiment.plant.spec, f"controller {entry.name!r}"
     if not isinstance(controller, ServoController):
-        raise ConfigurationError(
-            f"controller {entry.name!r} cannot be exported: it is not composed of an estimator and a law"
-        )
-    rows = 1 + experiment.run.preview_rows
-    shapes: dict[str, tuple[tuple[int, ...], str]] = {
-        "time": ((), "f"),
-        POSITION: ((spec.n,), "f"),
-        FEATURE: ((spec.m,), "f"),
-        SEEN: ((spec.m,), "b"),
-        REFERENCE: ((rows, spec.m), "f"),
-    }
+        raise ConfigurationError(f"{name} cannot be exported: it is not composed of an estimator and a law")
+    groups = controller_groups(spec.n, spec.m, 1 + experiment.run.preview_rows, spec.feature_unit)
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
+    shapes |= {each.name: (each.shape, "b" if each.name == SEEN else "f") for each in groups if each.role == INPUT}
     try:
         recorded = record(controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes)
     except NotTraceable as error:
         sensing = resolved.request.sensing
         where = "" if sensing == DEFAULT_SENSING else f" with --sensing {sensing}, but perhaps with another"
-        raise ConfigurationError(f"controller {entry.name!r} has no exported form{where}: {error}") from error
+        raise ConfigurationError(f"{name} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)
     if not difference <= TOLERANCE:
         raise ConfigurationError(
-            f"controller {entry.name!r} has no exported form for this robot and sensing: over a run it would "
-            f"differ from the original by {difference:.1g}, allowed is {TOLERANCE:g}"
+            f"{name} has no exported form for this robot and sensing: over a run it would differ from the original by "
+            f"{difference:.1g}, allowed is {TOLERANCE:g}"
         )
     return ControllerModel(
         name=entry.name,
         summary=entry.summary,
         recorded=recorded,
-        groups=controller_groups(spec.n, spec.m, rows, spec.feature_unit),
+        groups=groups,
         period=spec.period,
         run=run,
         settings="\n".join(f"{key} = {value}" for key, value in flatten(resolved.controller).items()),

@@ -73,9 +73,8 @@ class Waypoints(Reference):
     def __post_init__(self) -> None:
         """Check sizes and order."""
         if self.points.ndim != 2 or self.times.shape != (len(self.points),) or len(self.points) == 0:
-            raise ValueError(
-                f"waypoints need times (p,) and points (p, m), got {self.times.shape}, {self.points.shape}"
-            )
+            came = f"{self.times.shape}, {self.points.shape}"
+            raise ValueError(f"waypoints need times (p,) and points (p, m), got {came}")
         if not (np.diff(self.times) > 0.0).all() or self.times[0] < 0.0:
             raise ValueError("waypoint times must ascend, the first one from 0 s on")
 
@@ -127,13 +126,11 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     Raises:
         ValueError: the file is missing, lacks a column, or holds something that is not a finite number.
     """
-    names = ["time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names)]
-    values = numbers_of(f"waypoint file {path}", read_table("waypoint file", path), names)
+    file, names = f"waypoint file {path}", [f"{name}_{column_unit(feature.unit)}" for name in feature.names]
+    values = numbers_of(file, read_table("waypoint file", path), ["time_s", *names])
     if values[0, 0] > MAX_BEGIN:
-        raise ConfigurationError(
-            f"waypoint file {path} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on"
-        )
-    with configuration_errors(f"waypoint file {path}: "):
+        raise ConfigurationError(f"{file} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on")
+    with configuration_errors(f"{file}: "):
         return Waypoints(values[:, 0], values[:, 1:])
 
 

@@ -131,11 +131,7 @@ class RunRequest:
         return tuple(sorted(by_role.items(), key=lambda pair: (ORDER.get(pair[0], len(ORDER)), pair[0])))
 
     def _by_role(self, key: str) -> str:
-        """Return the key of a setting with the role of its section in place of a plant's, controller's or task's name.
-
-        Raises:
-            ConfigurationError: the run does not read such a section.
-        """
+        """Return a setting's key with the role of its section in place of a plant's, controller's or task's name."""
         if key in SHORT_NAMES:
             return SHORT_NAMES[key].key
         if key.startswith(SECTIONS):

@@ -85,7 +85,10 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
                 raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
         if request.plant == request.controller:
             raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
-    robot, period = _common_robot(requests), settings.resolve("run", RunSettings()).period
+    robots = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
+    if len(robots) > 1:  # of which they share the settings of plants and tasks
+        raise ConfigurationError(f"a batch has one robot, got {', '.join(robots)}; use a batch for each")
+    robot, period = find_robot(robots[0]), settings.resolve("run", RunSettings()).period
     find = installed_plant if to_run else find_plant
     plants, controllers, tasks = (dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES)
     defaults: dict[str, Any] = {"run": RunSettings()}
@@ -93,14 +96,6 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     defaults |= {name: default_config(find_controller(name), model_known=robot.known) for name in controllers}
     defaults |= {name: fitted(name, robot) for name in tasks}
     return Sections({name: settings.resolve(name, default) for name, default in defaults.items()})
-
-
-def _common_robot(requests: Iterable[RunRequest]) -> Robot:
-    """Return the robot of all runs of a batch, which share the settings of plants and tasks."""
-    names = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
-    if len(names) > 1:
-        raise ConfigurationError(f"a batch has one robot, got {', '.join(names)}; use a batch for each")
-    return find_robot(names[0])
 
 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass

@@ -201,9 +201,8 @@ def predicted(steps: Steps, delay: float | None = None) -> FloatArray:
     begin, end = frames[:-1], frames[1:]
     known = (end - begin <= MAX_LATE) & (t[begin] - late[begin] >= t[0])
     begin, end = begin[known], end[known]
-    moved = [
-        np.interp(t[end] - late[begin], t, q) - np.interp(t[begin] - late[begin], t, q) for q in steps.joint_position.T
-    ]
+    before, after = t[begin] - late[begin], t[end] - late[begin]
+    moved = [np.interp(after, t, q) - np.interp(before, t, q) for q in steps.joint_position.T]
     y[end] = steps.feature[begin] + np.matvec(steps.estimated_jacobian[begin], np.transpose(moved))
     return y
 

@@ -273,9 +273,8 @@ def _of_class(given: type[Any]) -> TaskEntry:
 def _checked(entry: TaskEntry, place: str) -> TaskEntry:
     default: object = entry.default
     if not (isinstance(default, Task) and is_dataclass(type(default))):
-        raise ConfigurationError(
-            f"{place}: the settings of a task must be a dataclass below Task, got {type(default).__name__}"
-        )
+        came = type(default).__name__
+        raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got {came}")
     return entry
 
 
