@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,16 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+class Period(NamedTuple):
+    """A control period of a run, or of runs side by side."""
+
+    observation: Observation  # at its begin
+    reference: FloatArray  # (..., 1 + preview, m), from its begin on [unit of the feature]
+    command: Command  # held during the period
+    truth: Truth  # the true feature and Jacobian at its begin
+    nanoseconds: tuple[int, int]  # wall-clock time of the controller's and of the plant's step
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,40 +137,27 @@ class StepLog:
         valid = np.empty((periods, *lanes), dtype=np.bool_)
         self._rows = Steps(spec, feature_valid=valid, diagnostics={}, **numbers)
 
-    def add(
-        self,
-        observation: Observation,
-        reference: FloatArray,
-        command: Command,
-        truth: Truth,
-        nanoseconds: tuple[int, int],
-        estimate: FloatArray | None,
-        diagnostics: Diagnostics,
-    ) -> None:
+    def add(self, period: Period, estimate: FloatArray | None, diagnostics: Diagnostics) -> None:
         """Write the next row.
 
         Args:
-            observation: the one that the controller got.
-            reference: (..., 1 + preview, m), of which the first row is logged [unit of the feature].
-            command: of the controller.
-            truth: the true feature and Jacobian of this instant.
-            nanoseconds: wall-clock time of the controller's and of the plant's step.
+            period: of whose reference the first row is logged.
             estimate: (..., m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
             diagnostics: the controller's own numbers; a name may come later than the first row.
         """
-        k, rows = self._count, self._rows
+        k, rows, observation, truth = self._count, self._rows, period.observation, period.truth
         rows.time[k] = observation.time
-        rows.reference[k] = reference[..., 0, :]
+        rows.reference[k] = period.reference[..., 0, :]
         rows.feature[k] = observation.feature
         rows.true_feature[k] = truth.feature
         rows.joint_position[k] = observation.joint_position
-        rows.command[k] = command.joint_velocity
+        rows.command[k] = period.command.joint_velocity
         rows.feature_valid[k] = observation.feature_valid
         if estimate is not None:
             rows.estimated_jacobian[k] = estimate
         if truth.jacobian is not None:
             rows.true_jacobian[k] = truth.jacobian
-        rows.controller_time[k], rows.plant_time[k] = (time / 1000.0 for time in nanoseconds)
+        rows.controller_time[k], rows.plant_time[k] = (time / 1000.0 for time in period.nanoseconds)
         for name, value in diagnostics.items():
             if name not in rows.diagnostics:
                 rows.diagnostics[name] = np.full(len(rows), np.nan)

@@ -16,19 +16,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.controller import Controller
-from servobench.harness.run.log import StepLog
+from servobench.harness.run.log import Period, StepLog
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.seeds import Seeds, named_seed
-from servobench.plant.contract.signals import Command, Observation, Truth
+from servobench.plant.contract.signals import Command, Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +47,6 @@ class LoopSettings:
     preview: int = 0  # future rows of the reference that a controller gets
     lost_after_periods: int = sys.maxsize  # a run ends after so many periods in a row without a valid feature
     camera_move: CameraMove | None = None  # a move of the camera in the middle of the run, or None
-
-
-class Period(NamedTuple):
-    """A control period of a run, or of runs side by side."""
-
-    observation: Observation  # at its begin
-    reference: FloatArray  # (..., 1 + preview, m), from its begin on [unit of the feature]
-    command: Command  # held during the period
-    truth: Truth  # the true feature and Jacobian at its begin
-    nanoseconds: tuple[int, int]  # wall-clock time of the controller's and of the plant's step
 
 
 @final
@@ -152,7 +142,7 @@ def run_loop(
     """
     rollout = begin(plant, controller, desired, settings, (_named(seed, "plant"), _named(seed, "controller")))
     for period in periods(rollout, controller):
-        log.add(*period, controller.estimated_jacobian(), controller.diagnostics())
+        log.add(period, controller.estimated_jacobian(), controller.diagnostics())
         lost = rollout.lost()
         if lost is not None:
             log.end(lost, rollout.loss())

@@ -7,7 +7,7 @@ from kit.plants import nominal_ur5
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import episode
 from servobench.harness.run.episode import carry_out, carry_out_together
-from servobench.harness.run.log import StepLog, Steps
+from servobench.harness.run.log import Period, StepLog, Steps
 from servobench.harness.run.outcome import find_outcome, joint_rests_at_limit
 from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
@@ -27,7 +27,7 @@ def logged(joints: list[tuple[float, float]], errors: list[float]) -> Steps:
     log = StepLog(SPEC, len(joints))
     for k, (q, error) in enumerate(zip(joints, errors, strict=True)):
         seen, truth = Observation(0.1 * k, list(q), [0.0]), Truth(np.zeros(1), None)
-        log.add(seen, np.array([[error]]), Command([0.0, 0.0]), truth, (0, 0), None, {})
+        log.add(Period(seen, np.array([[error]]), Command([0.0, 0.0]), truth, (0, 0)), None, {})
     return log.steps()
 
 
@@ -87,7 +87,8 @@ def test_a_target_out_of_reach_counts_before_a_joint_at_its_stop(target, at_stop
     q[2] = -2.35 if at_stop else -2.3
     for k in range(40):
         truth = Truth(target + 0.1, None)
-        log.add(Observation(0.05 * k, q, truth.feature), target[None], Command(np.zeros(6)), truth, (0, 0), None, {})
+        seen = Observation(0.05 * k, q, truth.feature)
+        log.add(Period(seen, target[None], Command(np.zeros(6)), truth, (0, 0)), None, {})
     scenario = Scenario(q, FixedPoint(target), 2.0, 1.5, "point_to_point")
     assert find_outcome(log.steps(), scenario, np.nan, 0.17, robot) == outcome
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servobench.harness.run.log import StepLog
+from servobench.harness.run.log import Period, StepLog
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
@@ -17,13 +17,12 @@ def straight_move(diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 
     log = StepLog(SPEC, 4)
     for k in range(periods):
         jacobian = np.diag([CONDITION[k], 1.0])
-        log.add(
+        period = Period(
             Observation(float(k), [0.1 * k, 0.0], [X[k] + 0.01, 0.0], k < 3),
             np.array([[1.0, 0.0]]),
             Command([VELOCITY[k], 0.0]),
             Truth(np.array([X[k], 0.0]), jacobian),
             (int(1e6 * milliseconds[k]), 5000),
-            None if ESTIMATE[k] is None else ESTIMATE[k] * jacobian,
-            diagnostics[k],
         )
+        log.add(period, None if ESTIMATE[k] is None else ESTIMATE[k] * jacobian, diagnostics[k])
     return log
