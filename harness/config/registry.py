@@ -40,7 +40,8 @@ MAPPED = "fmu:"
 ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
-CONTROLLERS = (*METHODS, *NOT_COMPOSED)
+CONTROLLERS: Final[Mapping[str, ControllerEntry | str]] = {**METHODS, **NOT_COMPOSED}
+MAPPINGS: Final = (".fmu", ".toml")  # endings of an FMU, or of a mapping of its names
 
 
 Offer: TypeAlias = Own[Any]
@@ -208,14 +209,9 @@ def _made_controller(name: str) -> ControllerEntry | None:
         return compose(law, estimator)
 
 
-PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=(".fmu", ".toml"))
+PLANT_REGISTRY: Final = Registry(PLANT, "servobench.plants", PLANTS, _mapped_plant, suffixes=MAPPINGS)
 CONTROLLER_REGISTRY: Final = Registry[ControllerEntry](
-    CONTROLLER,
-    "servobench.controllers",
-    dict[str, ControllerEntry | str](METHODS) | NOT_COMPOSED,
-    _made_controller,
-    suggest_pair,
-    (".fmu", ".toml"),  # an FMU, or a mapping of its names
+    CONTROLLER, "servobench.controllers", CONTROLLERS, _made_controller, suggest_pair, MAPPINGS
 )
 REGISTRIES: Final[Mapping[str, Registry[Any]]] = {"plant": PLANT_REGISTRY, "controller": CONTROLLER_REGISTRY}
 find_plant, choose_plant, plant_names = PLANT_REGISTRY.find, PLANT_REGISTRY.choose, PLANT_REGISTRY.names

@@ -43,7 +43,7 @@ VARIANTS: tuple[Mapping[str, str], ...] = (
 )
 
 
-def golden_runs(plant: str, controllers: tuple[str, ...] = CONTROLLERS) -> pd.DataFrame:
+def golden_runs(plant: str, controllers: tuple[str, ...] = tuple(CONTROLLERS)) -> pd.DataFrame:
     """Make the runs on a plant and return the rows of the table, without the spread."""
     settings: dict[str, dict[str, Any]] = {TASK: {"duration": DURATIONS[plant]}, "run": {"period": PERIOD}}
     if plant in RENDERED:
