@@ -109,9 +109,8 @@ class FmuController(Controller):
                 if variable.causality != "input":
                     raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
                 if (other := taken.setdefault(variable.name, role)) != role:
-                    raise ValueError(
-                        f"{file}: {role} and {other} both name the input {variable.name!r}; each has its own"
-                    )
+                    both = f"{role} and {other} both name the input {variable.name!r}"
+                    raise ValueError(f"{file}: {both}; each has its own")
         inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
         if idle := [name for name in inputs if name not in taken]:
             remark(f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value")
@@ -120,10 +119,8 @@ class FmuController(Controller):
         came = total_size(found["reference"])
         rows, rest = divmod(came, m)
         if rest or rows > 1 + preview:
-            raise ValueError(
-                f"{file}: reference must name {m} numbers a row for at most {1 + preview} rows, got {came}; "
-                "run.preview_time says how far it reaches"
-            )
+            wanted = f"{file}: reference must name {m} numbers a row for at most {1 + preview} rows"
+            raise ValueError(f"{wanted}, got {came}; run.preview_time says how far it reaches")
         return rows
 
     def reset(self, observation: Observation, seed: int) -> None:
@@ -213,10 +210,8 @@ def _conventional(path: Path) -> ControllerMapping:
     names: dict[str, Any] = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
     lacking = [CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names]
     if lacking:
-        raise ValueError(
-            f"{path.name} has no {', '.join(lacking)}, as exported controllers have; write a mapping of its names, "
-            f"such as {path.stem}.toml"
-        )
+        lack = f"{path.name} has no {', '.join(lacking)}, as exported controllers have"
+        raise ValueError(f"{lack}; write a mapping of its names, such as {path.stem}.toml")
     return ControllerMapping(path, **names)
 
 

@@ -55,9 +55,8 @@ class Settings:
         """Check that there are sections, and keys in them."""
         given: object = self.sections
         if not _is_section(given) or not all(_is_section(each) for each in self.sections.values()):
-            raise ConfigurationError(
-                f"settings must be sections with keys, such as {{'kinematic': {{'lag': 0.1}}}}, got {given!r}"
-            )
+            wanted = "sections with keys, such as {'kinematic': {'lag': 0.1}}"
+            raise ConfigurationError(f"settings must be {wanted}, got {given!r}")
 
     def check_sections(self, known: Iterable[str]) -> None:
         """Refuse sections that nothing would read.

@@ -341,10 +341,9 @@ def _build_controller(
     with configuration_errors(f"controller {name}: "):
         if entry.needs_truth:
             true = true_model()
-            nominal = knowledge.nominal_jacobian or true.jacobian
             knowledge = replace(
                 knowledge,
-                nominal_jacobian=nominal,
+                nominal_jacobian=knowledge.nominal_jacobian or true.jacobian,
                 true_jacobian=true.jacobian,
                 true_symbolic=true.symbolic,
                 true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0, true.latency_spread),
@@ -433,10 +432,8 @@ def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) ->
         rows = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
         for joint, value, lower, upper in rows:
             if not lower <= value <= upper:
-                raise ConfigurationError(
-                    f"task {resolved.request.task}: {what} must be within the joints' limits, {lower:.4g} to "
-                    f"{upper:.4g} rad for {joint}, got {value:g}"
-                )
+                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
+                raise ConfigurationError(f"task {resolved.request.task}: {what} must be {wanted}, got {value:g}")
 
 
 @lru_cache(maxsize=64)

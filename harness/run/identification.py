@@ -143,13 +143,9 @@ class Identified:
     def errors(self, log: Log, nominal: RobotModel) -> FloatArray:
         """Return the residuals of all valid frames of a log after the longest latency, (k, m)."""
         rows, latency = frames_of(log), self.values[self.names.index("latency")]
-        features = np.asarray(self.model(nominal).feature(motion(log)(log.time[rows] - latency)))
+        joints = CubicSpline(log.time, log.joints)(log.time[rows] - latency)
+        features = np.asarray(self.model(nominal).feature(joints))
         return np.asarray(log.features[rows] - features)
-
-
-def motion(log: Log) -> Any:  # noqa: ANN401 - of SciPy
-    """Return the joint positions of a log as a function of time."""
-    return CubicSpline(log.time, log.joints)
 
 
 def kind_of(name: str) -> str:
@@ -168,7 +164,7 @@ class _Problem:
     def __init__(self, log: Log, model: RobotModel, most: int, begin: Mapping[str, float]) -> None:
         self.rows = frames_of(log, most)
         self.time, self.y = log.time[self.rows], log.features[self.rows]
-        self.motion, self.log, self.middle = motion(log), log, float(log.time.mean())
+        self.motion, self.log, self.middle = CubicSpline(log.time, log.joints), log, float(log.time.mean())
         pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
         lens: tuple[str, ...] = () if pixels else LENS
         self.names = tuple(each for each in parameter_names(model.arm) if each not in ("command_delay", "lag", *lens))
@@ -334,9 +330,8 @@ def identify(
 
     sensing = model.setup.name if isinstance(model, SetupModel) else POSITION.name
     if sensing not in (POSITION.name, PIXEL.name) or (isinstance(model, SetupModel) and model.mount != "fixed"):
-        raise ConfigurationError(
-            f"identify takes logs with --sensing position or pixel, of a fixed camera; got {sensing}"
-        )
+        wanted = "logs with --sensing position or pixel, of a fixed camera"
+        raise ConfigurationError(f"identify takes {wanted}; got {sensing}")
     problem = _Problem(log, model, most, begin or {})
     inliers = np.ones(len(problem.rows), dtype=np.bool_)
     noise, z = np.eye(log.spec.m) * max(problem.spread, 1e-4 * log.spec.feature.scale) ** 2, problem.z

@@ -124,10 +124,8 @@ def _units(log: Log, model: RobotModel) -> str:
     rows = frames_of(log)
     moved, made = (np.linalg.norm(_spread(each)) for each in (log.features[rows], np.asarray(model.feature(q[rows]))))
     if spec.feature.unit == "m" and moved > MAX_RATIO * made:
-        return (
-            f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m: "
-            "they are likely in mm; write them in m"
-        )
+        found = f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m"
+        return f"{found}: they are likely in mm; write them in m"
     return ""
 
 
@@ -144,10 +142,8 @@ def _repeats(log: Log) -> str:
     if share <= MAX_REPEATED:
         return ""
     row = int(rows[1:][same & moving][0])
-    return (
-        f"{share:.0%} of the frames repeat the one before although the arm moves, first in row {row}: "
-        "give rows without a new frame feature_valid = 0"
-    )
+    found = f"{share:.0%} of the frames repeat the one before although the arm moves, first in row {row}"
+    return f"{found}: give rows without a new frame feature_valid = 0"
 
 
 def _large_errors(log: Log, robot: Identified) -> str:
@@ -187,11 +183,9 @@ def _moved(log: Log, model: RobotModel) -> str:
         growth = (sizes[1:] / sizes[:-1]) ** way
         if growth.max() > JUMP:
             row = rows[(int(growth.argmax()) + 1) * len(rows) // PARTS]
-            size = float(np.median(errors[(rows - row) * way >= 0]))
-            return (
-                f"features jump by {size:.2g} {log.spec.feature.unit} about {log.time[row]:.0f} s after the begin: the "
-                "camera or the ball was moved; cut the log there"
-            )
+            size, unit = float(np.median(errors[(rows - row) * way >= 0])), log.spec.feature.unit
+            jump = f"features jump by {size:.2g} {unit} about {log.time[row]:.0f} s after the begin"
+            return f"{jump}: the camera or the ball was moved; cut the log there"
     return ""
 
 

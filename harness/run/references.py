@@ -59,8 +59,7 @@ class FixedPoint(Reference):
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return the target, the same at all times."""
-        times = np.asarray(time, dtype=np.float64)
-        return np.broadcast_to(self.target, (*times.shape, len(self.target))).copy()
+        return np.broadcast_to(self.target, (*np.shape(time), len(self.target))).copy()
 
 
 @dataclass(frozen=True, eq=False)

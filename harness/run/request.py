@@ -293,18 +293,15 @@ def sensing_place(word: str) -> str:
 
 def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     """Return the set-up called `name` that a file defines, or without a name its only one."""
-    module, known = source.load(), SETUPS.values()
-    found = {
-        key: value for key, value in vars(module).items() if isinstance(value, SensingSetup) and value not in known
-    }
+    setups = {key: value for key, value in vars(source.load()).items() if isinstance(value, SensingSetup)}
+    found = {key: value for key, value in setups.items() if value not in SETUPS.values()}
     if name is None and len(found) == 1:
         return next(iter(found.values()))
     if name in found:
         return found[name]
     if not found:
-        raise ConfigurationError(
-            f"{file} defines no sensing set-up: no object of servobench.plant.cameras.setups.SensingSetup"
-        )
+        wanted = "no object of servobench.plant.cameras.setups.SensingSetup"
+        raise ConfigurationError(f"{file} defines no sensing set-up: {wanted}")
     first, *_ = found
     wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
     raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

@@ -176,9 +176,8 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
     if (commands := plant.log.commands) is not None:
         steps[[LOGGED + name for name in column_names(spec)[COMMAND]]] = commands
         if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
-            remark(
-                f"commands of the log reach {np.abs(commands).max():g} rad/s; if they are in deg/s, write them in rad/s"
-            )
+            reach = f"commands of the log reach {np.abs(commands).max():g} rad/s"
+            remark(f"{reach}; if they are in deg/s, write them in rad/s")
         if np.allclose(commands, plant.log.joints, atol=MAX_EXCESS):
             remark("commands of the log are its joint positions, and wanted are velocities")
     return steps

@@ -64,9 +64,8 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
     if response is None:
         lines.append("not told: delay and lag of commands, as the log has none")
     elif response.unexplained > MAX_UNEXPLAINED:
-        lines.append(
-            f"delay and lag leave {response.unexplained:.0%} of the joint motion: the drive is no first-order lag"
-        )
+        left = f"{response.unexplained:.0%} of the joint motion"
+        lines.append(f"delay and lag leave {left}: the drive is no first-order lag")
     for section, settings in sensor(log, robot).settings.items():
         words = ", ".join(f"{section}.{name}={value:.3g}" for name, value in settings.items())
         lines.append(f"settings of a plant: {words}")
