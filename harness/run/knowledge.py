@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
@@ -40,26 +40,23 @@ def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> Rob
 
 
 @final
+@dataclass(eq=False)
 class NetworkSource:
-    """Networks by training configuration: of this process, read from the cache, or trained on a nominal model.
+    """Networks by training configuration: of this process, read from the cache, or trained on a nominal model."""
 
-    Attributes:
-        given: those that a controller asked for.
-    """
-
-    def __init__(self, nominal_jacobian: JacobianFunction, spec: PlantSpec, progress: Progress | None = None) -> None:
-        """Take the model, the spec of the plant and a function that is called with the share of a training."""
-        self._jacobian, self._spec, self._progress = nominal_jacobian, spec, progress
-        self.given: list[TrainedNetworks] = []
+    nominal_jacobian: JacobianFunction
+    spec: PlantSpec  # of the plant
+    progress: Progress | None = None  # called with the share of a training
+    given: list[TrainedNetworks] = field(default_factory=list)  # those that a controller asked for
 
     def __call__(self, config: TrainingConfig) -> TrainedNetworks:
         """Return the networks of a configuration."""
 
         def make(folder: Path) -> None:
-            save_networks(train(config, self._jacobian, self._spec, self._progress), folder / FILE)
+            save_networks(train(config, self.nominal_jacobian, self.spec, self.progress), folder / FILE)
 
         with one_thread():
-            digest = training_digest(config, self._jacobian, self._spec)
+            digest = training_digest(config, self.nominal_jacobian, self.spec)
             key = (cache_folder(NETWORKS), digest)
             if key not in _KEPT:
                 while len(_KEPT) >= NETWORKS_KEPT:

@@ -14,7 +14,7 @@ an error (`careful`).
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter_ns
 from typing import Any, final
 
@@ -50,37 +50,26 @@ class LoopSettings:
 
 
 @final
+@dataclass(eq=False)
 class Rollout:
-    """The plant's side of a run, for a controller or for an agent that sends commands from elsewhere.
+    """The plant's side of a run, for a controller or for an agent that sends commands from elsewhere."""
 
-    Attributes:
-        plant: of one run, or of runs side by side.
-        observation: the present one.
-        k: periods that were begun.
-    """
-
-    def __init__(self, plant: Plant, observation: Observation, desired: FloatArray, settings: LoopSettings) -> None:
-        """Begin at an observation.
-
-        Args:
-            plant: of one run, or of runs side by side.
-            observation: the one that the plant returned last.
-            desired: (..., periods + preview, m), the desired features from now on.
-            settings: length of the run and the reasons to end it early.
-        """
-        self.plant, self.observation, self.k = plant, observation, 0
-        self._desired, self._settings = desired, settings
-        self._lost: Any = 0
+    plant: Plant  # of one run, or of runs side by side
+    observation: Observation  # the present one, which the plant returned last
+    desired: FloatArray  # (..., periods + preview, m), the desired features from the first observation on
+    settings: LoopSettings  # length of the run and the reasons to end it early
+    k: int = 0  # periods that were begun
+    _lost: Any = field(default=0, init=False)  # periods without a valid feature up to now, (...)
 
     @property
     def running(self) -> bool:
         """Whether a period is left."""
-        return self.k < self._settings.periods
+        return self.k < self.settings.periods
 
     @property
     def reference(self) -> FloatArray:
         """The reference from now on, (..., 1 + preview, m)."""
-        return self._desired[..., self.k : self.k + 1 + self._settings.preview, :]
+        return self.desired[..., self.k : self.k + 1 + self.settings.preview, :]
 
     def advance(self, command: Command) -> None:
         """Hold a command for a period.
@@ -88,7 +77,7 @@ class Rollout:
         Raises:
             RunFault: the plant cannot go on.
         """
-        move = self._settings.camera_move
+        move = self.settings.camera_move
         if move is not None and self.k == move.period:
             self.plant.move_camera(move.X_BC)
         self.k += 1
@@ -97,13 +86,13 @@ class Rollout:
 
     def lost(self) -> npt.NDArray[np.bool_] | None:
         """Return the runs, (...), that had no valid feature for too long; None if there are none."""
-        if np.max(self._lost) < self._settings.lost_after_periods:
+        if np.max(self._lost) < self.settings.lost_after_periods:
             return None
-        return np.asarray(self._lost >= self._settings.lost_after_periods)
+        return np.asarray(self._lost >= self.settings.lost_after_periods)
 
     def loss(self) -> FeatureLost:
         """Return the fault of runs that had no valid feature for too long."""
-        periods = self._settings.lost_after_periods
+        periods = self.settings.lost_after_periods
         return FeatureLost(f"no valid feature for {periods} periods, until {self.observation.time:g} s")
 
 
