@@ -54,7 +54,7 @@ class Guarded:
     """A function of a user, whose errors are one line and whose result is of a known kind."""
 
     make: Callable[..., Any]  # called with the settings and a `RobotKnowledge` or `PlantSetup`
-    kind: type[Controller] | type[Plant] | None = None  # class of the result; None for any
+    kind: type[Controller | Plant | World] | None = None  # class of the result; None for any
     with_config: bool = True  # whether it takes the settings
 
     def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - an object of `kind`
@@ -71,7 +71,7 @@ class Guarded:
             raise ConfigurationError(describe_at(error)) from error
         if self.kind is not None and not isinstance(made, self.kind):
             raise ConfigurationError(f"it is built as {type(made).__name__}, wanted a servobench.{self.kind.__name__}")
-        if isinstance(made, Plant):
+        if isinstance(made, Plant | World):
             _check_spec(made)
         return made
 
@@ -81,12 +81,7 @@ def copy_of(original: Controller, _knowledge: RobotKnowledge) -> Controller:
     return deepcopy(original)
 
 
-def on_bench(
-    world: type[World],
-    with_config: bool,
-    config: Any,  # noqa: ANN401 - any settings
-    setup: PlantSetup,
-) -> Bench:
+def on_bench(world: type[World], with_config: bool, config: object, setup: PlantSetup) -> Bench:
     """Return the bench around a world, with delay and sensing of the settings where they have these fields.
 
     Args:
@@ -95,13 +90,7 @@ def on_bench(
         config: the settings.
         setup: of the plant.
     """
-
-    def build(own: PlantSetup) -> World:
-        make: Callable[..., World] = add_checks(world)
-        made = make(config, own) if with_config else make(own)
-        _check_spec(made)
-        return made
-
+    build = partial(Guarded(add_checks(world), World, with_config), config)
     delay, sensing = getattr(config, "command_delay", 0.0), getattr(config, "sensing", SensingConfig())
     return build_bench(build, setup, delay, sensing)
 
@@ -265,7 +254,7 @@ PLANT: Final = Kind(
 )  # fmt: skip
 
 
-def _guarded(build: Callable[..., Any], kind: type[Controller] | type[Plant]) -> Guarded:
+def _guarded(build: Callable[..., Any], kind: type[Controller | Plant]) -> Guarded:
     return build if isinstance(build, Guarded) else Guarded(build, kind)
 
 

@@ -248,8 +248,7 @@ def _assemble(
             trained = in_view(knowledge, nominal, robot)
         source = network_source(trained, progress)
         true_model = plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
-        knowledge = replace(knowledge, train=source)
-        controller = _build_controller(request.controller, resolved.controller, knowledge, true_model)
+        controller = _build_controller(resolved, replace(knowledge, train=source), true_model)
     except BaseException:
         plant.close()
         raise
@@ -333,12 +332,10 @@ def _equations(model: RobotModel) -> TrueModel:
     return TrueModel(TrueJacobian(model), symbolic)
 
 
-def _build_controller(
-    name: str, config: object, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]
-) -> Controller:
+def _build_controller(run: ResolvedRun, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]) -> Controller:
     """Build a controller; the truth goes only to one that asks for it, as the nominal model where there is none."""
-    entry = find_controller(name)
-    with configuration_errors(f"controller {name}: "):
+    entry = find_controller(run.request.controller)
+    with configuration_errors(f"controller {run.request.controller}: "):
         if entry.needs_truth:
             true = true_model()
             knowledge = replace(
@@ -350,7 +347,7 @@ def _build_controller(
                 true_camera_turn=true.camera_turn,
                 true_tool=true.tool,
             )
-        return entry.build(config, knowledge)
+        return entry.build(run.controller, knowledge)
 
 
 def _check_times(resolved: ResolvedRun, duration: float) -> None:

@@ -19,7 +19,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline  # which loads the others, too
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
 from servobench.plant.contract.checks import FloatArray
@@ -251,8 +253,6 @@ class _Problem:
 
     def differences(self, z: FloatArray) -> FloatArray:
         """Return θ, for the camera the difference from its nominal pose in the same form."""
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - as above
-
         values, pose = self.scale * z, self.pose(z)
         turn = Rotation.from_matrix(self.nominal[:3, :3].T @ pose[:3, :3]).as_rotvec()
         values[self._of_camera] = np.concatenate([turn, pose[:3, 3] - self.nominal[:3, 3]])
@@ -261,8 +261,6 @@ class _Problem:
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
     """Return places (k, 3) as a camera sees them that is turned about its optical axis by angles (k,) [rad]."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - as above
-
     return np.asarray(Rotation.from_euler("z", -angle[:, None]).apply(places))
 
 
@@ -326,8 +324,6 @@ def identify(
     Raises:
         ConfigurationError: another sensing.
     """
-    from scipy.optimize import least_squares  # noqa: PLC0415 - half a second
-
     sensing = model.setup.name if isinstance(model, SetupModel) else POSITION.name
     if sensing not in (POSITION.name, PIXEL.name) or (isinstance(model, SetupModel) and model.mount != "fixed"):
         wanted = "logs with --sensing position or pixel, of a fixed camera"
@@ -347,14 +343,13 @@ def identify(
         )  # fmt: skip
         z = solved.x
         noise, inliers = robust_covariance(problem.errors(z))
-    return _posterior(problem, z, solved.jac[: -len(z)], noise, inliers)
+    return _posterior(problem, z, solved.jac[: -len(z)])
 
 
-def _posterior(
-    problem: _Problem, z: FloatArray, jacobian: FloatArray, noise: FloatArray, inliers: BoolArray
-) -> Identified:
+def _posterior(problem: _Problem, z: FloatArray, jacobian: FloatArray) -> Identified:
     """Return the robot at z with its uncertainty, given the Jacobian of the residuals, (k m, p)."""
     errors, s, unit = problem.errors(z), problem.scale, np.eye(len(z))
+    noise, inliers = robust_covariance(errors)
     correlation = correlation_time((errors @ np.linalg.inv(np.linalg.cholesky(noise)).T) * inliers[:, None])
     information = jacobian.T @ jacobian / correlation
     covariance = np.linalg.inv(information + unit)
@@ -411,8 +406,6 @@ class Response(NamedTuple):
 
 def command_response(log: Log) -> Response | None:
     """Return delay and lag of the joints; None for a log without commands, or without motion."""
-    from scipy.optimize import least_squares  # noqa: PLC0415 - as above
-
     if log.commands is None or not np.ptp(log.commands, axis=0).any():
         return None
     spec, steps = log.spec, np.diff(log.joints, axis=0)
