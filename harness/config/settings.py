@@ -78,10 +78,9 @@ class Settings:
         names = list(running)
         for section, _, text in self.assigned:
             if section not in names:
-                raise ConfigurationError(
-                    f"--set {text}: {section!r} does not run here, so this has no effect; sections that run: "
-                    f"{listed(names)}; settings of other runs may stand in a file (--config)"
-                )
+                found = f"--set {text}: {section!r} does not run here, so this has no effect"
+                remedy = "settings of other runs may stand in a file (--config)"
+                raise ConfigurationError(f"{found}; sections that run: {listed(names)}; {remedy}")
 
     @configuration_errors()
     def resolve(self, section: str, default: Config) -> Config:

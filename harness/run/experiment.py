@@ -415,10 +415,9 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
         on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]
         what = "its target" if len(points) == 1 else "a point of its curve,"
-        raise ConfigurationError(
-            f"task {task}: {what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's reach; "
-            f"for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
-        )
+        found = f"{what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's reach"
+        remedy = f"for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
+        raise ConfigurationError(f"task {task}: {found}; {remedy}")
 
 
 def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:

@@ -79,10 +79,8 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     run = _run(experiment)
     difference = _difference(recorded, run)
     if not difference <= TOLERANCE:
-        raise ConfigurationError(
-            f"{name} has no exported form for this robot and sensing: over a run it would differ from the original by "
-            f"{difference:.1g}, allowed is {TOLERANCE:g}"
-        )
+        differs = f"over a run it would differ from the original by {difference:.1g}, allowed is {TOLERANCE:g}"
+        raise ConfigurationError(f"{name} has no exported form for this robot and sensing: {differs}")
     return ControllerModel(
         name=entry.name,
         summary=entry.summary,

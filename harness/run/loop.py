@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter_ns
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +31,7 @@ from servobench.plant.contract.seeds import Seeds, named_seed
 from servobench.plant.contract.signals import Command, Observation
 
 
-@dataclass(frozen=True, eq=False)
-class CameraMove:
+class CameraMove(NamedTuple):
     """A change of the camera's pose during a run that the controller must notice by itself."""
 
     period: int  # the first period with the new pose

@@ -151,10 +151,8 @@ def _large_errors(log: Log, robot: Identified) -> str:
     share = float(_shares(log, robot).max())
     if share < REFUSED_SHARE or _is_noise(log, robot):
         return ""
-    return (
-        f"errors are {share:.0%} of the motion, and neither one mistake nor two explain them: check order, directions "
-        "and zeros of the joints, the axes of the camera, and whether it was moved"
-    )
+    found = f"errors are {share:.0%} of the motion, and neither one mistake nor two explain them"
+    return f"{found}: check order, directions and zeros of the joints, the axes of the camera, and whether it was moved"
 
 
 def _drift(log: Log, robot: Identified) -> str:

@@ -139,10 +139,9 @@ class RunRequest:
         for role in ROLES:
             if key.startswith(f"{getattr(self, role)}."):
                 return f"{role}{key.removeprefix(getattr(self, role))}"
-        raise ConfigurationError(
-            f"the setting {key} cannot be varied in runs of {self.controller} on {self.plant}, task {self.task}: "
-            f"wanted SECTION.KEY with one of the sections run, {', '.join(ROLES)}, such as plant.sensing.latency"
-        )
+        runs = f"runs of {self.controller} on {self.plant}, task {self.task}"
+        wanted = f"SECTION.KEY with one of the sections run, {', '.join(ROLES)}, such as plant.sensing.latency"
+        raise ConfigurationError(f"the setting {key} cannot be varied in {runs}: wanted {wanted}")
 
     def varied_in(self, role: str) -> Varied:
         """Return the varied settings of a section, `run` or one of `ROLES`, by dotted key within it."""

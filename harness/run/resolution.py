@@ -125,9 +125,8 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     plant, of_profile = request.varied_in("plant"), _of_profile(request, sections)
     twin = find_robot(request.robot).twin
     drawn = () if twin is None else _drawn_times(twin, flatten(sections[request.plant]), request.seed)
-    for key, _ in plant:
-        if key in of_sensor:
-            raise ConfigurationError(f"plant.{key} is varied, and the mismatch {request.mismatch} sets it, too")
+    if both := [key for key, _ in plant if key in of_sensor]:
+        raise ConfigurationError(f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too")
     return ResolvedRun(
         request,
         sections.with_changes("run", request.varied_in("run")),

@@ -82,10 +82,8 @@ class LoggedPlant(Plant):
         spec, q = self.spec, self.log.joints
         beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
         row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
-        where = (
-            f"row {row} of the log has {spec.joint_names[joint]} at {q[row, joint]:g} rad, beyond its range of "
-            f"{spec.joint_lower[joint]:.4g} to {spec.joint_upper[joint]:.4g} rad"
-        )
+        name, limits = spec.joint_names[joint], f"{spec.joint_lower[joint]:.4g} to {spec.joint_upper[joint]:.4g} rad"
+        where = f"row {row} of the log has {name} at {q[row, joint]:g} rad, beyond its range of {limits}"
         if beyond.max() > math.pi:
             raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
         if beyond.max() > MAX_EXCESS:
@@ -106,10 +104,9 @@ class LoggedPlant(Plant):
         valid, unit = self.log.valid, self.spec.feature.unit
         apart, mirrored = min(_apart(y[-k:][valid[-k:]], p[:k][valid[-k:]], unit) for k in rows)
         if apart > MAX_SHARE_APART.get(unit, MAX_SHARE_APART["px"]):
-            remark(
-                f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}: look for other "
-                "units, another order or sign of joints, another arm, or a camera that was moved"
-            )
+            found = f"features of the log move otherwise than this robot's at these joints, by {apart:.0%}"
+            causes = "other units, another order or sign of joints, another arm, or a camera that was moved"
+            remark(f"{found}: look for {causes}")
         elif mirrored:
             remark("features of the log are mirrored: x points right in the image, y down, z ahead")
 
@@ -216,10 +213,9 @@ def _check_delay(steps: Steps, ahead: FloatArray) -> None:
     own, *others = (_rms(each) for each in (steps.feature - tried)[:, common])
     best = int(np.argmin(others))
     if others[best] < MIN_GAIN * own:
-        remark(
-            f"features of the log come {delays[best]:g} s after the joint motion: with this delay the Jacobian would "
-            f"predict them with {others[best] / own:.0%} of the error; look for the controller's setting of the delay"
-        )
+        late = f"features of the log come {delays[best]:g} s after the joint motion"
+        better = f"with this delay the Jacobian would predict them with {others[best] / own:.0%} of the error"
+        remark(f"{late}: {better}; look for the controller's setting of the delay")
 
 
 def _rms(values: FloatArray) -> float:

@@ -21,8 +21,8 @@ differently before the first camera:
 The start is found on the nominal arm. Where an arm cannot reach it with the target in view, D is made smaller.
 """
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Final, Literal
+from dataclasses import replace
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -49,8 +49,7 @@ STEPS: Final = 8  # in which the arm is led from home to the start
 IN_VIEW: Final = 0.9  # of the image's half sides in which the target is at the start
 
 
-@dataclass(frozen=True, eq=False)
-class Box:
+class Box(NamedTuple):
     """Where to draw."""
 
     lower: FloatArray  # (n,) [rad]
