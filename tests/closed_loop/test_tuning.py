@@ -41,7 +41,6 @@ from servobench.harness.studies.tuning.spaces import (
     find_tunable,
     first_points,
     inside,
-    is_switch,
     nested_settings,
     values_of,
     widened,
@@ -133,7 +132,11 @@ def test_settings_are_nested_and_rounded_to_three_digits():
 
 @pytest.mark.parametrize("name", SPACES)
 def test_best_equipped_methods_have_the_words_of_the_aids_as_switches_and_published_ones_none(name):
-    words = {key.removeprefix("aids.") for key, values in SPACES[name].items() if key in AIDS and is_switch(values)}
+    words = {
+        key.removeprefix("aids.")
+        for key, values in SPACES[name].items()
+        if key in AIDS and isinstance(values, CategoricalDistribution)
+    }
     own = {"ukf_mpc": {"feedforward", "limit"}}.get(name, set())
     bounded = name.endswith(":published") or name in {"constant", "calibrated"}
     assert words == (set() if bounded else set(EQUIPPED) - own - {"posture"})
@@ -145,7 +148,7 @@ def test_the_first_points_hold_the_defaults_the_values_in_use_and_every_value_of
     settings = [nested_settings(point) for point in points]
     assert points[0] == default_values(entry)
     assert nested_settings(values_of(name, default_config(entry))) in settings
-    for key in filter(lambda key: is_switch(space[key]), space):
+    for key in (key for key in space if isinstance(space[key], CategoricalDistribution)):
         for choice in space[key].choices:
             assert nested_settings({**points[0], key: choice}) in settings
     assert len({str(each) for each in settings}) == len(points)

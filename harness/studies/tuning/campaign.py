@@ -15,6 +15,7 @@ import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, final
@@ -27,11 +28,11 @@ from servobench.harness.studies.tuning.objective import (
     LEDGER,
     SECOND,
     Ledger,
+    Trial,
     TuningSet,
     Wanted,
     fill,
     open_ledger,
-    refuse_broken_defaults,
     score,
 )
 from servobench.harness.studies.tuning.spaces import (
@@ -121,7 +122,7 @@ class Method:
         self.second = open_ledger(folder, name, plan.runs.second(), SECOND)
         entry = find_tunable(name)
         self._default = nested_settings(default_values(entry))
-        self._known = [self._default, nested_settings(tuned_point(entry) or default_values(entry))]
+        self._known = [self._default, nested_settings(tuned_point(entry))]
         space, first = find_space(name), first_points(name)
         seeds = range(plan.study_seed, plan.study_seed + plan.studies)
         self.studies = [RunningStudy(study(name, space, first, plan.trials, plan.search, seed)) for seed in seeds]
@@ -154,17 +155,11 @@ class Method:
         They are the best ones on the second set: of a study, the defaults, or the values in use so far.
         """
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
-        seconds = [self.second.costs(each.settings) for each in outcomes]
-        records = [
-            replace(outcome, second_score=score(costs))
-            for outcome, costs in zip(outcomes, seconds, strict=True)
-            if costs is not None
-        ]
-        if len(records) < len(self.studies):
-            return None
-        candidates = [*(each.settings for each in records), *self._scored()]
+        candidates = [*(each.settings for each in outcomes), *self._scored()]
         costs = [self.second.costs(each) for each in candidates]
         mean = [math.inf if each is None else score(each) for each in costs]
+        if len(outcomes) < len(self.studies) or math.inf in mean[: len(outcomes)]:
+            return None
         best, runs = candidates[mean.index(min(mean))], self._plan.runs
         mine, theirs = self.ledger.costs(best), self.ledger.costs(self._default)
         on_second = self.second.costs(self._default)
@@ -187,7 +182,7 @@ class Method:
             checked_score=score([mine[i] for i in checked]),
             checked_score_of_defaults=score([theirs[i] for i in checked]),
             settings=best,
-            studies=tuple(records),
+            studies=tuple(replace(each, second_score=mean[i]) for i, each in enumerate(outcomes)),
             edges=edge_lines(self.name, best),
         )
 
@@ -210,8 +205,8 @@ def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
         ConfigurationError: a ledger of the folder is another one, or a method cannot be built.
     """
     methods = [Method(folder, name, plan) for name in plan.controllers]
-    for method in methods:
-        refuse_broken_defaults(method.name, plan.runs)
+    for method in methods:  # an error that no setting can cure is reported before any run
+        Trial(method.name, default_config(find_tunable(method.name))).build(plan.runs.runs())
     return methods
 
 
@@ -277,7 +272,7 @@ def write_tuned(path: Path, tuned: TunedValues) -> None:
     records = values.pop("studies")
     text = HEADING + _table(values if records else {**values, "studies": ()})
     text += "".join(_table(record, "studies.", "\n[[studies]]\n") for record in records)
-    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def _table(values: Mapping[str, Any], before: str = "", heading: str = "") -> str:
@@ -320,17 +315,18 @@ class Check:
             ConfigurationError: a name or a file that cannot be used.
         """
         self._runs = runs
-        self._changes: list[tuple[Ledger, str, str, Point, Point]] = []
+        self._changes: list[tuple[Ledger, list[dict[str, Any]], partial[Change]]] = []
         points: dict[str, Wanted] = {}
         for name in controllers:
-            refuse_broken_defaults(name, runs)
+            config = default_config(find_tunable(name))
+            Trial(name, config).build(runs.runs())
             ledger = open_ledger(folder, name, runs, SECOND)
-            space, values = find_space(name), values_of(name, default_config(find_tunable(name)))
+            space, values = find_space(name), values_of(name, config)
             for key, other in neighbours(space, values):
-                before, after = nested_settings(values), nested_settings(other)
-                if after != before:
-                    self._changes.append((ledger, name, key, values, other))
-                    points |= {f"{name}{each}": (ledger, name, each) for each in (before, after)}
+                both = [nested_settings(values), nested_settings(other)]
+                if both[0] != both[1]:
+                    self._changes.append((ledger, both, partial(Change, name, key, values[key], other[key])))
+                    points |= {f"{name}{each}": (ledger, name, each) for each in both}
         self._points = list(points.values())
 
     def __len__(self) -> int:
@@ -347,12 +343,8 @@ class Check:
 
     def changes(self) -> list[Change]:
         """Return every change whose scores are known."""
-        known = []
-        for ledger, name, key, values, other in self._changes:
-            before, after = (ledger.costs(nested_settings(point)) for point in (values, other))
-            if before is not None and after is not None:
-                known.append(Change(name, key, values[key], other[key], score(before), score(after)))
-        return known
+        known = [(change, *map(ledger.costs, both)) for ledger, both, change in self._changes]
+        return [change(score(before), score(after)) for change, before, after in known if before and after]
 
 
 def improvements(changes: Sequence[Change]) -> list[Change]:

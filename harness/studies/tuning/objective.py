@@ -36,7 +36,7 @@ from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_siz
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import Settings, apply_settings, default_config, file_stem, flatten
+from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest, RunSettings, Varied, read_mismatch
@@ -165,6 +165,14 @@ class Trial:
         requests = [replace(run, controller=self.controller) for run in runs]
         sections = Sections(resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config})
         return [select(request, sections) for request in requests]
+
+    def build(self, runs: Sequence[RunRequest]) -> None:
+        """Build the first of some runs and throw it away; its networks are trained before workers need them.
+
+        Raises:
+            ConfigurationError: the settings cannot be used. Any other failure is left to the runs, whose cost says so.
+        """
+        build_once(self.resolved(runs[:1])[0])
 
 
 Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
@@ -315,17 +323,6 @@ def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
     }
 
 
-def refuse_broken_defaults(controller: str, runs: TuningSet) -> None:
-    """Build the first run with the settings in use: an error that no setting can cure is reported before any run.
-
-    Raises:
-        ConfigurationError: a name or setting that cannot be used.
-    """
-    reason = refusal(Trial(controller, default_config(find_tunable(controller))), runs)
-    if reason is not None:
-        raise ConfigurationError(reason)
-
-
 def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
     """Score the points that their ledgers lack, each once, and yield the controller of each as soon as it is written.
 
@@ -338,7 +335,8 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
             continue
         try:
             trial = Trial(name, apply_settings(find_tunable(name), nested))
-            refused = refusal(trial, runs) is not None or not bears_delay(trial)
+            trial.build(requests)
+            refused = not bears_delay(trial)
         except ConfigurationError:
             refused = True
         if refused:
@@ -354,18 +352,6 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
             ledger, trial, nested = points[point_index]
             ledger.add(nested, costs[point_index].tolist())
             yield trial.controller
-
-
-def refusal(trial: Trial, runs: TuningSet) -> str | None:
-    """Return why a run with these settings cannot be built, or None; networks are trained before workers need them.
-
-    Any other failure is left to the runs, whose cost says so.
-    """
-    try:
-        build_once(trial.resolved(runs.runs()[:1])[0])
-    except ConfigurationError as error:
-        return str(error)
-    return None
 
 
 def bears_delay(trial: Trial) -> bool:

@@ -24,7 +24,7 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 
 import math
 import warnings
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -118,11 +118,7 @@ _CFDL: Final[Space] = {
 }
 
 
-def _aids(without: Collection[str] = ()) -> Space:
-    """Return the space of the aids but for those that a law or an estimator brings."""
-    return {key: values for key, values in _AIDS.items() if key.removeprefix("aids.") not in without}
-
-
+_MPC_AIDS: Final = {key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")}
 _MPC_SWITCHES: Final[Space] = {"law.mode": CategoricalDistribution(("constant", "moves")), "law.use_preview": _SWITCH}
 _START: Final[Space] = {"initial.source": CategoricalDistribution(("nominal", "probe"))}
 _RBFNN_SWITCHES: Final[Space] = {
@@ -133,22 +129,22 @@ _RBFNN_SWITCHES: Final[Space] = {
 }
 
 SPACES: Final[Mapping[str, Space]] = {
-    "rbfnn_mfac": {**_aids(), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
+    "rbfnn_mfac": {**_AIDS, **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
-    "regression_mfac": {**_aids(), **_MFAC},
-    "ukf_mfac": {**_aids(), **_START, **_MFAC, **_UKF},
+    "regression_mfac": {**_AIDS, **_MFAC},
+    "ukf_mfac": {**_AIDS, **_START, **_MFAC, **_UKF},
     "ukf_mfac:published": {**_MFAC, **_UKF},
-    "ukf_mpc": {**_aids({"feedforward", "limit"}), **_START, **_MPC_SWITCHES, **_MPC, **_UKF},
+    "ukf_mpc": {**_MPC_AIDS, **_START, **_MPC_SWITCHES, **_MPC, **_UKF},
     "ukf_mpc:published": {**_MPC, **_UKF},
-    "rbf_pid": {**_aids(), **_PID, **_LYAPUNOV},
+    "rbf_pid": {**_AIDS, **_PID, **_LYAPUNOV},
     "rbf_pid:published": {**_P, **_LYAPUNOV},
     "constant": _PI,
     "calibrated": _PI,
-    "broyden": {**_aids(), **_START, **_PID, **_BROYDEN},
+    "broyden": {**_AIDS, **_START, **_PID, **_BROYDEN},
     "broyden:published": {**_P, **_BROYDEN},
-    "rls": {**_aids(), **_START, **_PID, **_RLS},
+    "rls": {**_AIDS, **_START, **_PID, **_RLS},
     "rls:published": {**_P, **_RLS},
-    "cfdl_mfac": {**_aids(), **_START, **_MFAC, **_CFDL},
+    "cfdl_mfac": {**_AIDS, **_START, **_MFAC, **_CFDL},
     "cfdl_mfac:published": {**_MFAC, **_CFDL},
 }
 
@@ -172,7 +168,12 @@ def find_space(name: str) -> Space:
     """
     find_tunable(name)
     space = widened(SPACES[name], flatten(tuned_settings(name)))
-    return {key: space[key] for key in sorted(space, key=lambda key: not is_switch(space[key]))}
+    return {**_switches(space), **space}
+
+
+def _switches(space: Space) -> Space:
+    """Return the parameters of a space that are a choice, not a number."""
+    return {key: choice for key, choice in space.items() if isinstance(choice, CategoricalDistribution)}
 
 
 def edges(space: Space, values: Point) -> dict[str, str]:
@@ -208,11 +209,6 @@ def widened(space: Space, values: Point) -> Space:
             low = low / WIDER if box.step is None else max(2 * low - high, box.step)
         wider[key] = type(box)(low, high, log=box.log, step=box.step)
     return wider
-
-
-def is_switch(distribution: Distribution) -> bool:
-    """Return whether a parameter is a choice, not a number."""
-    return isinstance(distribution, CategoricalDistribution)
 
 
 def default_values(entry: ControllerEntry) -> Point:
@@ -280,7 +276,8 @@ def study(
     for number in range(trials):
         if number < len(first):
             sampled.enqueue_trial(dict(first[number]))
-        sampled.sampler = _sampler(named_seed(seed, f"{name}, trial {number}"))
+        with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
+            sampled.sampler = TPESampler(seed=named_seed(seed, f"{name}, trial {number}"), multivariate=True)
         with np.errstate(all="ignore"):  # the sampler's densities may underflow
             trial = sampled.ask(dict(space))
         score = yield trial.params
@@ -290,12 +287,6 @@ def study(
     found = yield from coordinate_search(space, tried[best][1], tried[best][0], search)
     search_end = (found.evaluations, found.complete, found.score, math.nan, nested_settings(found.values))
     return StudyRecord(seed, trials, best, tried[best][0], *search_end)
-
-
-def _sampler(seed: int) -> TPESampler:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        return TPESampler(seed=seed, multivariate=True)
 
 
 def coordinate_search(space: Space, values: Point, score: float, budget: int) -> Generator[Point, float, Found]:
@@ -357,24 +348,20 @@ def first_points(name: str) -> list[Point]:
     tuned values with those of other methods for the keys that both have.
     """
     entry, space = find_tunable(name), find_space(name)
-    default = default_values(entry)
-    own = tuned_point(entry) or default
-    switches = [key for key in space if is_switch(space[key])]
-    flips = [{**default, key: other} for key in switches for other in changes(space[key], default[key])]
+    default, own = default_values(entry), tuned_point(entry)
+    flips = [point for _, point in neighbours(_switches(space), default)]
     points = [default, own, *flips, *_borrowed(name, own)]
     return list({str(nested_settings(point)): point for point in points}.values())
 
 
-def tuned_point(entry: ControllerEntry) -> Point | None:
-    """Return the tuned values in use as a point of the controller's space; None if there are none that fit."""
-    settings = tuned_settings(entry.name)
-    if not settings:
-        return None
+def tuned_point(entry: ControllerEntry) -> Point:
+    """Return the tuned values in use as a point of the controller's space; the defaults if there are none that fit."""
+    default, settings = default_values(entry), tuned_settings(entry.name)
     try:
         values = values_of(entry.name, apply_settings(entry, settings))
     except ConfigurationError:
-        return None  # a file of an earlier version
-    return inside(find_space(entry.name), values, default_values(entry))
+        return default  # a file of an earlier version
+    return inside(find_space(entry.name), values, default) if settings else default
 
 
 def _borrowed(name: str, own: Point) -> Iterator[Point]:
