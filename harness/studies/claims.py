@@ -87,6 +87,9 @@ class Measurement:
     holds: bool | None = None
 
 
+Cases = Sequence[Measurement]
+
+
 @dataclass(frozen=True)
 class Answer:
     """The answer to one claim on one plant."""
@@ -129,14 +132,9 @@ def studies(
     four = (PROPOSED, *OTHERS)
     own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
     both = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
-    return {
-        MAIN: Campaign(cells(four, MOVES, robots) + cells(four, (CIRCLE,), some), Settings(rendered)),
-        TIMED: Campaign(both, Settings(rendered), timed=True),
-        **{
-            name: Campaign(own, Settings({**rendered, PROPOSED + suffix: reading}))
-            for name, reading in READINGS.items()
-        },
-    }
+    read = {name: Campaign(own, Settings({**rendered, PROPOSED + suffix: each})) for name, each in READINGS.items()}
+    main = cells(four, MOVES, robots) + cells(four, (CIRCLE,), some)
+    return {MAIN: Campaign(main, Settings(rendered)), TIMED: Campaign(both, Settings(rendered), timed=True), **read}
 
 
 def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> list[Answer]:
@@ -336,25 +334,18 @@ def circle_error(runs: pd.DataFrame, controller: str, label: str = "") -> Measur
     return Measurement("circle, RMS of the second lap, mm", CIRCLE, label or controller, error)
 
 
-def held(measured: Sequence[Measurement]) -> int:
+def held(cases: Cases) -> int:
     """Return in how many cases the rule holds."""
-    return sum(bool(m.holds) for m in measured)
+    return sum(bool(m.holds) for m in cases)
 
 
-def answer(
-    claim: str,
-    statement: str,
-    plant: str,
-    judged: Sequence[Measurement],
-    evidence: str,
-    further: Sequence[Measurement] = (),
-) -> Answer:
-    """Return the answer whose verdict follows from the cases `judged`; `further` measurements are for the figure."""
-    count, decided = held(judged), sum(m.holds is not None for m in judged)
-    if count == len(judged):
+def answer(claim: str, statement: str, plant: str, cases: Cases, evidence: str, further: Cases = ()) -> Answer:
+    """Return the answer whose verdict follows from the cases judged; `further` measurements are for the figure."""
+    count, decided = held(cases), sum(m.holds is not None for m in cases)
+    if count == len(cases):
         verdict = REPRODUCED
     elif count == decided:
         verdict = UNDECIDED
     else:
         verdict = f"{DEPENDS}: holds in {count} of {decided}" if count else NOT_REPRODUCED
-    return Answer(claim, statement, plant, verdict, evidence, (*judged, *further))
+    return Answer(claim, statement, plant, verdict, evidence, (*cases, *further))

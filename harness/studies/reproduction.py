@@ -18,16 +18,7 @@ from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
-from servobench.harness.studies.claims import (
-    DIVISIONS,
-    MAIN,
-    MISMATCH,
-    UNDECIDED,
-    Answer,
-    Measurement,
-    answer_all,
-    studies,
-)
+from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import write_atomically
 
@@ -43,12 +34,7 @@ Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]  # claim, plant, 
 
 
 def reproduce(
-    out: Path,
-    plants: Sequence[str],
-    robots: int,
-    how: Execution,
-    divisions: Sequence[str] = tuple(DIVISIONS),
-    mismatch: str = MISMATCH,
+    out: Path, plants: Sequence[str], robots: int, how: Execution, divisions: Sequence[str], mismatch: str
 ) -> list[Answer]:
     """Carry out the runs and answer the claims.
 
@@ -57,7 +43,7 @@ def reproduce(
         plants: names.
         robots: number of robots for each move; two fifths of them for the circle.
         how: how the runs are carried out.
-        divisions: how the methods are equipped, keys of `DIVISIONS`.
+        divisions: how the methods are equipped, keys of `servobench.harness.studies.claims.DIVISIONS`.
         mismatch: of all robots.
 
     Returns:
@@ -197,11 +183,7 @@ def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
         other.plant
         for other in answers
         if (other.claim, other.division) == (answer.claim, answer.division)
-        and _outcome(other) != _outcome(answer)
+        and other.verdict.partition(":")[0] != answer.verdict.partition(":")[0]
         and UNDECIDED not in (other.verdict, answer.verdict)
     ]
     return f" (otherwise on {', '.join(others)})" if others else ""
-
-
-def _outcome(answer: Answer) -> str:
-    return answer.verdict.partition(":")[0]

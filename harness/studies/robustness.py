@@ -211,12 +211,9 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | Non
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
     arrived = f"Runs that came within {settling_band(runs)} and stayed"
     took = "Median settling time, from the move where the camera moves"
-    return [
-        *_draw(runs, folder / "robustness", arrived, Scale(settled_share, "settled runs [%]", 104.0), limits or {}),
-        *_draw(
-            runs, folder / "robustness_settling", took, Scale(settling_median, "settling time [s]", 10.0), limits or {}
-        ),
-    ]
+    share, time = Scale(settled_share, "settled runs [%]", 104.0), Scale(settling_median, "settling time [s]", 10.0)
+    files = _draw(runs, folder / "robustness", arrived, share, limits or {})
+    return files + _draw(runs, folder / "robustness_settling", took, time, limits or {})
 
 
 def settling_median(runs: pd.DataFrame) -> Estimate:
@@ -232,18 +229,13 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
     controllers = list(dict.fromkeys(runs["controller"]))
     styles = style.method_styles(controllers)
     curves: dict[str, Curves] = {}
-    for line in KNOWN_LINES.values():
-        if line.axis in set(runs["axis"]):
-            cells = dict(iter(runs[runs["axis"] == line.axis].groupby(["controller", "magnitude"])))
-            curves[line.axis] = {
-                name: [scale.measure(cells[name, place.number]) for place in line.places] for name in controllers
-            }
+    for axis, line in KNOWN_LINES.items():
+        if axis in set(runs["axis"]):
+            cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
+            numbers = [place.number for place in line.places]
+            curves[axis] = {name: [scale.measure(cells[name, each]) for each in numbers] for name in controllers}
     flat = [axis for axis in curves if _is_flat(curves[axis])]
-    lines = [
-        line
-        for line in KNOWN_LINES.values()
-        if line.axis in curves and (line.axis not in flat or len(flat) == len(curves))
-    ]
+    lines = [KNOWN_LINES[axis] for axis in curves if axis not in flat or len(flat) == len(curves)]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with style.figure_style(style.TEXT):
         figure, panels = style.panel_grid(len(lines), 1.9, head=1.5)
@@ -275,11 +267,8 @@ def _is_flat(curves: Curves) -> bool:
 def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     """Return a sentence on the axes along which nothing differs."""
     found = next(iter(curves[flat[0]].values()))[0]
-    words = "; ".join(
-        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title)
-        for line in KNOWN_LINES.values()
-        if line.axis in flat
-    )
+    lines = [KNOWN_LINES[axis] for axis in flat]
+    words = "; ".join(re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in lines)
     return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
 
 
@@ -289,7 +278,6 @@ def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: st
     drawn = {name: 1000.0 * limit for name, limit in limits.items() if name in styles and 1000.0 * limit <= last}
     for name, limit in drawn.items():
         axes.axvline(limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6)
-    words = f"upright: predicted limit of stability of {', '.join(drawn)}" + ", others beyond" * (
-        len(drawn) < len(limits)
-    )
+    beyond = ", others beyond" * (len(drawn) < len(limits))
+    words = f"upright: predicted limit of stability of {', '.join(drawn)}{beyond}"
     axes.set_xlabel(f"{line.title}\n{textwrap.fill(words, NOTE // 3)}" if drawn else line.title)

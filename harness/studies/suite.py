@@ -31,7 +31,7 @@ from servobench.harness.studies.challenge import MEASURES, Challenge
 from servobench.plant.contract.files import write_csv
 
 MAX_REFERENCE_LOSS: Final = 0.05
-REFERENCE_SETTINGS: Final = {"nmpc_calibrated": {"image": True}}  # references see the images of all methods
+SEEING: Final = "nmpc_calibrated"  # reference that sees the images of all methods
 RUNS, METHODS, RANKING, PICTURE = "scores.csv", "methods.csv", "ranking.csv", "suite"
 FACTORS: Final = (1.1, 2.0, 10.0)  # times the best method of a run, of the profile in the table
 DRAWN_FACTORS: Final = tuple(np.geomspace(1.0, 100.0, 81).tolist())
@@ -55,13 +55,9 @@ def carry_out_suite(
     requests = [run.request for own in runs.values() for run in own]
     check_settings(settings, [name for each in requests for name in (each.plant, each.controller, each.task)])
     check_effects(settings, requests, steps=False)
-    sections = {
-        name: {**REFERENCE_SETTINGS.get(name, {}), **settings.sections.get(name, {})}
-        for name in {*REFERENCE_SETTINGS, *settings.sections}
-    }
-    resolve_sections(requests, Settings(sections))  # all challenges are checked before the first one runs
-    parts = {name: Campaign(own, Settings(sections)) for name, own in runs.items()}
-    tables = carry_out_parts(parts, out, how)
+    whole = Settings({**settings.sections, SEEING: {"image": True, **settings.sections.get(SEEING, {})}})
+    resolve_sections(requests, whole)  # all challenges are checked before the first one runs
+    tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)
     judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
     write_csv(judged, out / RUNS)
     for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):

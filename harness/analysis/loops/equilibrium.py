@@ -122,11 +122,8 @@ class Rest:
 
     def observation(self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0) -> Observation:
         """Return the observation of other values, (..., m) and (..., n), `after` [s] later."""
-        lead = feature.shape[:-1]
-        valid: Any = np.full(lead, True)[()] if lead else np.True_
-        return trusted_observation(
-            self.time + after, joint_position, feature, valid, np.full(feature.shape, fill_value=True)
-        )
+        seen = np.full(feature.shape, fill_value=True)
+        return trusted_observation(self.time + after, joint_position, feature, seen.all(axis=-1), seen)
 
     def reference(self, feature: FloatArray) -> FloatArray:
         """Return the constant reference (..., 1 + preview, m) at a desired feature, (..., m)."""

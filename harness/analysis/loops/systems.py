@@ -63,13 +63,12 @@ class StateSpace(NamedTuple):
         return np.stack([np.ravel(step) for step in steps], axis=-1)
 
 
-def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) -> StateSpace:
-    """Return the loop of a strictly proper plant with a controller whose command is multiplied by `gain`.
+def closed_loop(plant: StateSpace, controller: StateSpace) -> StateSpace:
+    """Return the loop of a strictly proper plant with a controller.
 
     Args:
         plant: from the command u to the measured signals, D = 0.
         controller: from measurements and then references to u.
-        gain: factor on u between controller and plant.
 
     Returns:
         From the references to the measured signals; the states are those of the plant, then the controller's.
@@ -77,22 +76,15 @@ def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) ->
     measured = len(plant.C)
     B, D = controller.B, controller.D
     by_plant, by_law = D[:, :measured] @ plant.C, controller.C
-    A = np.block(
-        [[plant.A + gain * plant.B @ by_plant, gain * plant.B @ by_law], [B[:, :measured] @ plant.C, controller.A]]
-    )
-    references = np.vstack([gain * plant.B @ D[:, measured:], B[:, measured:]])
+    A = np.block([[plant.A + plant.B @ by_plant, plant.B @ by_law], [B[:, :measured] @ plant.C, controller.A]])
+    references = np.vstack([plant.B @ D[:, measured:], B[:, measured:]])
     C = np.hstack([plant.C, np.zeros((measured, len(controller.A)))])
     return StateSpace(A, references, C, np.zeros((measured, references.shape[1])))
 
 
-def decay(A: FloatArray) -> float:
-    """Return the spectral radius of A, the factor of the slowest or the growing mode in a period; 0 without states."""
-    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-
-
 def is_stable(A: FloatArray) -> bool:
     """Return whether no mode grows; neutral ones, such as a rest of the arm in any null-space posture, may be there."""
-    return decay(A) <= 1.0 + STABILITY_TOLERANCE
+    return bool(np.abs(np.linalg.eigvals(A)).max(initial=0.0) <= 1.0 + STABILITY_TOLERANCE)
 
 
 @dataclass(frozen=True, eq=False)
