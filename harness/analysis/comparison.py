@@ -321,10 +321,8 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
     curve = texts_of(runs, "task_kind") == CURVE
     follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
-    on_curve, moved = (
-        np.where(follows, FOLLOWED, NOT_FOLLOWED),
-        np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED),
-    )
+    on_curve = np.where(follows, FOLLOWED, NOT_FOLLOWED)
+    moved = np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED)
     guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
     guessed = guessed.where(runs["status"] == COMPLETED, runs["status"])
     told = texts_of(runs, "outcome").astype(object)

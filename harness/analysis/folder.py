@@ -37,10 +37,8 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     by = (manifest.get("packages") or {}).get("servobench") or "unknown"
     commit = f", commit {manifest['git_commit']}" if manifest.get("git_commit") else ""
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {by}{commit}"
-    return facts | {
-        "seeds": _seeds(runs["seed"].tolist()),
-        "made": f"{made}, Python {manifest.get('python', 'unknown')}",
-    }
+    made += f", Python {manifest.get('python', 'unknown')}"
+    return facts | {"seeds": _seeds(runs["seed"].tolist()), "made": made}
 
 
 def describe_controllers(folder: Path) -> str:

@@ -45,9 +45,7 @@ def scores(own: ArrayLike, reference: ArrayLike, floor: ArrayLike) -> FloatArray
     Raises:
         ValueError: a floor that is not above 0.
     """
-    own, reference, floor = np.broadcast_arrays(
-        *(np.asarray(each, dtype=np.float64) for each in (own, reference, floor))
-    )
+    own, reference, floor = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in (own, reference, floor)))
     if not (floor > 0.0).all():
         raise ValueError(f"floor must be above 0, got {float(np.min(floor))}")
     known = np.where(np.isfinite(own), np.maximum(own, floor), np.inf)
@@ -71,10 +69,11 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     """
     by_robot = _by_robot(table, "score")
     means, drawn = _means_with_resamples(by_robot)
-    estimates = _estimates(means, drawn, len(by_robot))
-    apart = _told_apart(means, drawn)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    ends, apart = drawn.quantile([tail, 1.0 - tail]), _told_apart(means, drawn)
     found: list[Ranked] = []
-    for place, (name, estimate) in enumerate(estimates.items(), start=1):
+    for place, name in enumerate(map(str, means.index), start=1):
+        estimate = Estimate(float(means[name]), *map(float, ends[name]), len(by_robot))
         shared = found and frozenset((found[found[-1].rank - 1].controller, name)) not in apart
         rank = found[-1].rank if shared else place
         found.append(Ranked(rank, name, estimate, float((by_robot[name] == 0.0).mean())))
@@ -162,12 +161,6 @@ def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.
     ]
     means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(ascending=False, kind="stable")
     return means, pd.DataFrame(drawn, columns=by_robot.columns)
-
-
-def _estimates(means: pd.Series[float], drawn: pd.DataFrame, count: int) -> dict[str, Estimate]:
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = drawn.quantile(tail), drawn.quantile(1.0 - tail)
-    return {str(name): Estimate(float(means[name]), float(low[name]), float(high[name]), count) for name in means.index}
 
 
 def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[str]]:

@@ -134,24 +134,15 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
         error = factor * column_of(own, judged).where(own["status"] == COMPLETED)
-        row = {
-            "controller": Cell(str(name)),
-            "runs": Cell(len(own)),
-            f"{achievement(runs)} [%]": Cell(achieved_share(own), ".1f"),
-        }
+        row = {"controller": Cell(str(name)), "runs": Cell(len(own))}
+        row[f"{achievement(runs)} [%]"] = Cell(achieved_share(own), ".1f")
         if judged == "steady_state_error":
-            row |= {
-                heading["settling_time_s"]: Cell(_median(settling_times(own)), ".2f"),
-                heading["overshoot"]: Cell(_median(100.0 * column_of(own, "overshoot")), ".1f"),
-            }
-        rows.append(
-            row
-            | {
-                heading[judged]: Cell(_median(error), ".1f"),
-                f"its worst 5 % {heading[judged].rpartition(' ')[2]}": Cell(tail_mean(error, TAIL), ".1f"),
-                "failures": Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none"),
-            }
-        )
+            row[heading["settling_time_s"]] = Cell(_median(settling_times(own)), ".2f")
+            row[heading["overshoot"]] = Cell(_median(100.0 * column_of(own, "overshoot")), ".1f")
+        row[heading[judged]] = Cell(_median(error), ".1f")
+        row[f"its worst 5 % {heading[judged].rpartition(' ')[2]}"] = Cell(tail_mean(error, TAIL), ".1f")
+        row["failures"] = Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none")
+        rows.append(row)
     return rows
 
 
@@ -169,15 +160,13 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     if metric not in numbers:
         raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
-    label, (unit, factor) = metric.replace("_", " "), ("1", 1.0)
-    if metric in METRICS:
-        label, (unit, factor) = METRICS[metric].label, shown_unit(metric, runs)
-    difference = f"mean difference in {label}" if unit == "1" else f"mean difference in {label} [{unit}]"
+    unit, factor = shown_unit(metric, runs) if metric in METRICS else ("1", 1.0)
+    heading = metric_heading(metric, runs) if metric in METRICS else metric.replace("_", " ")
     return [
         {
             PAIR: Cell(f"{first} − {second}"),
             "runs lost": Cell("{} : {}".format(*each.lost)),
-            difference: Cell(each.mean.scaled(factor), ".2f"),
+            f"mean difference in {heading}": Cell(each.mean.scaled(factor), ".2f"),
             "verdict": Cell(each.verdict),
             "P(A better)": Cell(each.probability, ".2f"),
             "margin": Cell(f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")),
@@ -222,12 +211,11 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
-        known = [(column, metric.summary) for column, metric in METRICS.items() if metric.summary]
-        own_first = sorted(known, key=lambda pair: pair[1].kind is None)
         summaries = [
-            (column, summary)
-            for column, summary in own_first
-            if summary.kind in (kind, None) and not is_superfluous(column, place)
+            (column, metric.summary)
+            for wanted in (kind, None)  # measures of such tasks first
+            for column, metric in METRICS.items()
+            if metric.summary and metric.summary.kind == wanted and not is_superfluous(column, place)
         ]
         rows = []
         for name, own in place.groupby("controller", sort=False):
@@ -332,9 +320,8 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
             table, metric = judged_values(place), judged_metric(place)
             digits, known = METRICS[metric].digits, name in table and len(table)
-            row[where, metric_heading(metric, place)] = (
-                f"{median_with_interval(table[name]):.{digits}f}" if known else MISSING
-            )
+            middle = f"{median_with_interval(table[name]):.{digits}f}" if known else MISSING
+            row[where, metric_heading(metric, place)] = middle
         rows.append(row)
     return grouped(rows)
 
@@ -352,9 +339,8 @@ def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the shares of outcomes [%] of each condition, task and controller of which a run failed."""
     named = runs.assign(outcome=outcomes(runs))
-    mixed = [
-        (row, own) for row, own in _rows(named, [*_varied(runs), "task"]) if not own["outcome"].isin(ACHIEVED).all()
-    ]
+    rows = _rows(named, [*_varied(runs), "task"])
+    mixed = [(row, own) for row, own in rows if not own["outcome"].isin(ACHIEVED).all()]
     found = {str(word) for _, own in mixed for word in own["outcome"]}
     table = []
     for row, own in mixed:

@@ -60,14 +60,13 @@ def judge(runs: pd.DataFrame) -> Verdict:
     early = int((runs["status"] != COMPLETED).sum())
     cautions = [f"{early} of {len(runs)} runs ended early."] if early else []
     if bounds:
-        cautions.append(f"{_listed(bounds)} {_verb(bounds, 'knows', 'know')} the true robot: shown, not ranked.")
+        know = "knows" if len(bounds) == 1 else "know"
+        cautions.append(f"{_listed(bounds)} {know} the true robot: shown, not ranked.")
     chosen = runs[runs["controller"].isin(ranked)]
     if len(ranked) == 1:
         return Verdict(_of_one_controller(chosen), tuple(cautions))
-    often = _of_several(chosen)
-    if not (winners := _winners(runs, ranked)):
-        return Verdict(often, (_doubts(chosen), *cautions))
-    return Verdict(winners, (often, _doubts(chosen), *cautions))
+    result, *further = filter(None, (_winners(runs, ranked), _of_several(chosen)))
+    return Verdict(result, (*further, _doubts(chosen), *cautions))
 
 
 def ranked_controllers(runs: pd.DataFrame) -> list[str]:
@@ -79,9 +78,8 @@ def ranked_controllers(runs: pd.DataFrame) -> list[str]:
 def asked_of(runs: pd.DataFrame) -> str:
     """Return the goal of these runs as a verb in the past tense."""
     moves, curves = (len(part) for part in split_tasks(runs))
-    return {(True, False): "settled", (False, True): "followed the curve"}.get(
-        (moves > 0, curves > 0), "settled or followed the curve"
-    )
+    words = {(True, False): "settled", (False, True): "followed the curve"}
+    return words.get((moves > 0, curves > 0), "settled or followed the curve")
 
 
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
@@ -286,10 +284,6 @@ def _shares(runs: pd.DataFrame) -> dict[str, float]:
 def _share(runs: pd.DataFrame) -> str:
     good, share = int(outcomes(runs).isin(ACHIEVED).sum()), achieved_share(runs)
     return f"{good} of {len(runs)} runs (95 % interval: {share.low:.0f} to {share.high:.0f} %)"
-
-
-def _verb(names: Sequence[str], one: str, many: str) -> str:
-    return one if len(names) == 1 else many
 
 
 def _listed(names: Sequence[str], most: int = NAMED) -> str:
