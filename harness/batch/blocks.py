@@ -251,7 +251,7 @@ def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -
         tell({"unreadable": astuple(Ending.of(error))})
         return
     tell(None)  # the time limit begins after the imports
-    _carry_out(block, lambda result: tell(pack_result(result)), steps, keep)
+    _carry_out(block, lambda result: tell(pack_result(result)), steps, keep, debug=False)
 
 
 def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
@@ -268,9 +268,7 @@ def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool,
     return unpacked
 
 
-def _carry_out(
-    block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool = False
-) -> None:
+def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool) -> None:
     """Carry a block out and tell the result of each run."""
     with offering(block.own):
         together: list[RunResult] = []
@@ -403,8 +401,8 @@ def open_workers(
     scheduler: str | Executor | None = None,
     bounds: Bounds = Bounds(),  # noqa: B008 - it is frozen
     *,
-    plants: Iterable[str] = (),
-    controllers: Iterable[str] = (),
+    plants: Collection[str] = (),
+    controllers: Collection[str] = (),
     own: Sequence[Offer] = (),
     trusted: Collection[str] = (),
 ) -> Iterator[Workers]:
@@ -439,7 +437,6 @@ def open_workers(
         with _open_cluster(scheduler) as workers:
             yield workers
         return
-    plants, controllers = tuple(plants), tuple(controllers)
     foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
     foreign = foreign or any(map(is_foreign_controller, controllers))
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
@@ -466,18 +463,15 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
             f"the scheduler {scheduler} does not answer; start one with `dask scheduler --host 127.0.0.1` and name "
             "its address"
         ) from error
-    try:
+    with contextlib.closing(client):
         try:
             client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
         except TimeoutError as error:
             raise ConfigurationError(
                 f"the scheduler {scheduler} has no workers; start some with `dask worker {scheduler} --nthreads 1`"
             ) from error
-
         threads = sum(client.nthreads().values())
         yield _workers_of(client.get_executor(pure=False), threads, lost=(KilledWorker,))
-    finally:
-        client.close()
 
 
 def _workers_of(executor: Executor, count: int, lost: tuple[type[BaseException], ...] = ()) -> Workers:

@@ -214,9 +214,8 @@ def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[
     """
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest.get("campaign"):
-        raise ConfigurationError(
-            f"{folder} holds results of other runs or settings: {difference(there, manifest)}; {remedy}"
-        )
+        other = difference(there, manifest)
+        raise ConfigurationError(f"{folder} holds results of other runs or settings: {other}; {remedy}")
     if changed := changed_source(there, manifest):
         raise ConfigurationError(
             f"{folder} was begun with another version of {changed}; {remedy}, or bring the former one back"
@@ -296,12 +295,8 @@ def _carry_out_missing(
     how.observer.begin(end - begin, end - begin - missing)
     ends = [range(begin, begin), *done, range(end, end)]
     gaps = (range(one.stop, next_one.start) for one, next_one in pairwise(ends))
-    blocks = cut(
-        jobs.at(chain.from_iterable(gaps)),
-        even_size(missing, place.count, how.block),
-        1 if campaign.steps else CHUNK,
-        own,
-    )
+    size = even_size(missing, place.count, how.block)
+    blocks = cut(jobs.at(chain.from_iterable(gaps)), size, 1 if campaign.steps else CHUNK, own)
     keep = folder if campaign.steps and not place.cluster else None
     return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
 
@@ -337,12 +332,10 @@ def _without_effect(assignment: Assignment, examples: Iterable[RunRequest], step
 
 def _remark_on_idle(settings: Settings, runs: Iterable[ResolvedRun]) -> None:
     """Remark on assignments to settings that count only together with another one."""
-    parts = [(run.request.plant, run.plant) for run in runs] + [
-        (run.request.controller, run.controller) for run in runs
-    ]
+    used = [(run.request.plant, run.plant) for run in runs] + [(run.request.controller, run.controller) for run in runs]
     for section, key, text in settings.assigned:
         name, idle = NEEDED.get(key, ("", ()))
-        values = [flatten(config).get(name) for part, config in parts if part == section]
+        values = [flatten(config).get(name) for part, config in used if part == section]
         if values and all(value in idle for value in values):
             remark(f"--set {text} has no effect while {section}.{name} is {values[0]}")
 

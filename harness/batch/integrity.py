@@ -180,8 +180,8 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
 class _Part:
     names: list[str]  # of its files within the folder, rows last
     count: int  # of its runs that are intact
-    wrong: str = ""  # name of its damaged file
-    fault: str = ""  # of that file
+    wrong: str  # name of its damaged file, or of its rows
+    fault: str  # of that file; empty if there is none
 
 
 def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
@@ -190,24 +190,22 @@ def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
     for index in results.part_indices(folder):
         names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
         names = [name for name in names if results.is_expected(folder, name)]
-        faults = [(name, wrong) for name in names if (wrong := _fault(folder, name))]
-        rows = results.part_name(index, RUNS)
-        if not faults:
+        rows, count = results.part_name(index, RUNS), 0
+        name, wrong = next(((name, wrong) for name in names if (wrong := _fault(folder, name))), (rows, ""))
+        if not wrong:
+            count = tables.row_count(folder, rows)
             batch, _, first = tables.owner(folder, rows).rpartition("@")
             if batch not in ("", campaign or batch):
-                faults = [(rows, "holds the rows of another batch")]
+                wrong = "holds the rows of another batch"
             elif first not in ("", f"{index}"):
-                faults = [(rows, "holds the rows of other runs")]
+                wrong = "holds the rows of other runs"
             elif index < end:
-                faults = [(rows, "holds runs that the part before it has, too")]
-            elif index + tables.row_count(folder, rows) > manifest.get("run_count", math.inf):
-                faults = [(rows, "holds more runs than the batch has")]
-        if faults:
-            yield _Part(names, 0, *faults[0])
-        else:
-            count = tables.row_count(folder, rows)
-            end = index + count
-            yield _Part(names, count)
+                wrong = "holds runs that the part before it has, too"
+            elif index + count > manifest.get("run_count", math.inf):
+                wrong = "holds more runs than the batch has"
+            else:
+                end = index + count
+        yield _Part(names, 0 if wrong else count, name, wrong)
 
 
 def _fault(folder: Path, name: str) -> str | None:

@@ -176,7 +176,7 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
         ConfigurationError: it has, or it cannot be read.
     """
     try:
-        taken = folder.exists() and not is_unused(folder)
+        taken = not is_unused(folder)
     except OSError as error:
         raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
     if taken:
@@ -210,9 +210,7 @@ def is_unused(folder: Path) -> bool:
     if not folder.is_dir():
         return not folder.exists()
     try:
-        inside = (
-            path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name)
-        )
-        return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in inside)
+        left = (path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name))
+        return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in left)
     except FileNotFoundError:  # another process has just put its parts together
         return False

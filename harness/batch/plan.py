@@ -49,7 +49,7 @@ class Batch:
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
-        return Grid(_request, [self.robot], *self.axes())
+        return Grid(_run, [self.robot], *self.axes())
 
     def axes(self) -> tuple[Sequence[Any], ...]:
         """Return sensing set-ups, plants, tasks, mismatches, controllers and seeds."""
@@ -57,9 +57,7 @@ class Batch:
         return self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
 
 
-def _request(
-    robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
-) -> RunRequest:
+def _run(robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
     return RunRequest(plant, controller, task, mismatch, seed, robot=robot, sensing=sensing)
 
 
@@ -242,7 +240,7 @@ class SweepPlan:
         return Grid(_cell, places or [Place()], varied, [self.batch.robot], *self.batch.axes())
 
 
-def _cell(place: Place, varied: Varied, *own: Any) -> Cell:  # noqa: ANN401 - as those of `_request`
+def _cell(place: Place, varied: Varied, *own: Any) -> Cell:  # noqa: ANN401 - as those of `_run`
     robot, sensing, plant, task, mismatch, controller, seed = own
     request = RunRequest(plant, controller, task, place.vary(mismatch), seed, varied, robot, sensing)
     return Cell(request, place.columns)

@@ -139,10 +139,8 @@ def resident_memory(processes: Iterable[int]) -> int:
 
 def own_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    return sum(
-        _ask(process, lambda each: getattr(each.memory_full_info(), "pss" if LINUX else "uss")) or 0
-        for process in processes
-    )
+    kind = "pss" if LINUX else "uss"
+    return sum(_ask(process, lambda each: getattr(each.memory_full_info(), kind)) or 0 for process in processes)
 
 
 def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer

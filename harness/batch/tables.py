@@ -92,29 +92,23 @@ def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
         batch: whose rows these are.
     """
     schema = table.schema.with_metadata({BATCH: batch} if batch else None)
-    with path.open("wb") as file, _writer(file, schema) as writer:
+    with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
         if len(table):
             writer.write_table(table.cast(schema))
 
 
 def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
     """Write tables as one, holding few rows in memory; the columns that a table lacks are null."""
-    schema = common_schema(folder, names)
+    schema = common_schema(folder, names).with_metadata({BATCH: batch} if batch else None)
     waiting = schema.empty_table()
-    with path.open("wb") as target, _writer(target, schema.with_metadata({BATCH: batch} if batch else None)) as writer:
+    with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
         for name in names:
             with opened(folder, name) as part:  # threads and datasets would hold memory that grows with the parts
                 table = part.read(use_threads=False).replace_schema_metadata()
                 waiting = pa.concat_tables([waiting, table], promote_options="permissive")
-            if len(waiting) >= ROW_GROUP:
-                writer.write_table(waiting.replace_schema_metadata(writer.schema.metadata))
+            if len(waiting) >= ROW_GROUP or (name == names[-1] and len(waiting)):
+                writer.write_table(waiting.replace_schema_metadata(schema.metadata))
                 waiting = schema.empty_table()
-        if len(waiting):
-            writer.write_table(waiting.replace_schema_metadata(writer.schema.metadata))
-
-
-def _writer(file: Any, schema: pa.Schema) -> pq.ParquetWriter:  # noqa: ANN401 - an open file
-    return pq.ParquetWriter(file, schema, write_page_checksum=True)
 
 
 def read_tables(
@@ -223,10 +217,8 @@ TEXTS: Final = frozenset(
     ("run_id", "plant", "controller", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit",
      "status", "outcome", "reason", "mismatch_values", "part")
 )  # fmt: skip
-NUMBERS: Final = frozenset(
-    {"seed", "periods", "settling_band", *METRICS, *(short.column for short in SHORT_NAMES.values())}
-)
 WHOLE: Final = frozenset(("seed", "periods"))
+NUMBERS: Final = frozenset({"settling_band", *WHOLE, *METRICS, *(short.column for short in SHORT_NAMES.values())})
 MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}  # and 0 is the least
 RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
