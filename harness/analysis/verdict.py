@@ -161,10 +161,7 @@ class _Standing(NamedTuple):
 
 
 def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
-    """Return a sentence that names the best of some controllers in each place, and how large the difference is.
-
-    Empty where nothing is shown.
-    """
+    """Return a sentence that names the best in each place, and by how much; empty where nothing is shown."""
     known = [_standing(*each) for each in _competitions(runs, names)]
     if not any(len(each.equal) > 1 or each.behind or each.ahead for each in known):
         return ""

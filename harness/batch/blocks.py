@@ -369,11 +369,7 @@ def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
 
 
 def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
-    """Return an array.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return the array of a text; a ValueError if it is that of none."""
     if text is None:
         return None
     with configuration_errors("", EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError):

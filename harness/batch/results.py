@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import re
 import shutil
@@ -26,6 +25,7 @@ import pyarrow.dataset as ds
 from servobench.harness.batch import tables
 from servobench.harness.batch.lock import LOCK, PARTS, check_empty, refuse_links
 from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
+from servobench.harness.config.description import plain
 from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
@@ -392,11 +392,7 @@ def _intact(folder: Path, kind: str) -> list[str]:
 
 
 def _refuse_damaged(folder: Path, names: Sequence[str]) -> None:
-    """Refuse damaged files.
-
-    Raises:
-        DamagedFile: names the first of them.
-    """
+    """Raise a `DamagedFile` that names the first damaged one of some files."""
     for name in names:
         if (wrong := file_fault(folder, name)) is not None:
             raise DamagedFile(folder, name, wrong)
@@ -425,7 +421,7 @@ class OtherSchema(ConfigurationError):
 
 def encode(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as text; JSON has no infinity, so a setting without limit reads "inf"."""
-    return json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
+    return json.dumps(plain({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
 
 
 def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
@@ -456,14 +452,6 @@ def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
             wanted = " of ".join(WORDS[each] for each in types)
             raise DamagedFile(folder, name, f"is damaged: {key} must be {wanted}, got {str(manifest[key])[:SHOWN]!r}")
     return dict(manifest)
-
-
-def _in_json(value: Any) -> Any:  # noqa: ANN401 - any entry of a manifest
-    if isinstance(value, dict):
-        return {key: _in_json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_in_json(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _has_type(value: Any, kind: type, inner: type | None = None) -> bool:  # noqa: ANN401 - any JSON

@@ -254,21 +254,13 @@ def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:
 
 
 def _build_controller(name: str, robot: str) -> None:
-    """Build the run of a controller and throw it away.
-
-    Raises:
-        ConfigurationError: it cannot be built, in one line.
-    """
+    """Build the run of a controller and throw it away; a `ConfigurationError` of one line says why it cannot be."""
     request = RunRequest(PLANT, name, TASK, read_mismatch("none"), 0, robot=robot)
     build(resolve(request, Settings()), progress=_stop).plant.close()
 
 
 def _build_plant(name: str, robot_name: str) -> None:
-    """Build a plant and throw it away.
-
-    Raises:
-        ConfigurationError: it cannot be built, in one line.
-    """
+    """Build a plant and throw it away; see `_build_controller`."""
     entry, robot, period = installed_plant(name), find_robot(robot_name), RunSettings().period
     setup = PlantSetup(robot.nominal, robot.workspace.home, period, robot)
     if entry.own_robot:

@@ -86,6 +86,8 @@ def toml(value: Any) -> str:  # noqa: ANN401 - any setting
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - any setting
     """Return a value as JSON can have it: arrays as lists, paths as text, infinity as the text "inf"."""
+    if isinstance(value, dict):
+        return {key: plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray | tuple | list):
         return [plain(each) for each in value]
     if isinstance(value, float):

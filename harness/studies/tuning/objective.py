@@ -285,11 +285,7 @@ class Ledger:
 
 
 def _costs(given: object) -> list[float]:
-    """Return the costs of a record.
-
-    Raises:
-        ValueError: they are no numbers.
-    """
+    """Return the costs of a record; a ValueError if they are no numbers."""
     if not isinstance(given, list) or not given or not all(type(each) in (int, float) for each in given):
         raise ValueError(f"costs must be a list of numbers, got {str(given)[:SHOWN]}")
     return [float(each) for each in given]
