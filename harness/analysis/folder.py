@@ -121,13 +121,12 @@ def _table(title: str, rows: pd.DataFrame) -> str:
     letters = sum(rows[name].str.len().max() for name in rows)
     kind = "table" if letters <= ONE_COLUMN else "table*"
     sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
-    body = [" & ".join(map(_cell, row)) for row in rows.itertuples(index=False)]
     lines = [
         rf"\begin{{{kind}}}\centering\footnotesize\setlength{{\tabcolsep}}{{4pt}}",
         rf"\caption{{{title.translate(SIGNS)}}}",
         rf"\begin{{tabular}}{{@{{}}{sides}@{{}}}}\toprule",
         rf"{' & '.join(map(_heading, rows.columns, sides))} \\\midrule",
-        *(rf"{line} \\" for line in body),
+        *(rf"{' & '.join(map(_cell, row))} \\" for row in rows.itertuples(index=False)),
         rf"\bottomrule\end{{tabular}}\end{{{kind}}}",
     ]
     return "\n".join(lines)
@@ -135,11 +134,9 @@ def _table(title: str, rows: pd.DataFrame) -> str:
 
 def _heading(name: str, side: str) -> str:
     words, _, unit = name.partition(" [")
-    lines = [
-        line.translate(SIGNS)
-        for line in (*textwrap.wrap(words.replace(" %", "\u00a0%"), HEADING), *([f"[{unit}"] if unit else []))
-    ]
-    return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}" + r"\\{}".join(lines) + r"\end{tabular}"
+    lines = textwrap.wrap(words.replace(" %", "\u00a0%"), HEADING) + [f"[{unit}"] * bool(unit)
+    text = r"\\{}".join(line.translate(SIGNS) for line in lines)
+    return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}"
 
 
 def _cell(text: str) -> str:

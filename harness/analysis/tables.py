@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any, Final, TypeAlias
 
@@ -91,8 +91,7 @@ class Cell:
     def plain(self) -> object:
         """Return it as JSON can have it: an estimate with its ends, None for no number, "inf" for infinity."""
         if isinstance(self.value, Estimate):
-            ends = {"value": self.value.value, "low": self.value.low, "high": self.value.high}
-            return {name: _plain(number) for name, number in ends.items()} | {"count": self.value.count}
+            return {name: _plain(number) for name, number in asdict(self.value).items()}
         return self.value if isinstance(self.value, str) else _plain(self.value)
 
 

@@ -201,12 +201,12 @@ def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = Fal
     return Task(function, packed, block.jobs[0].owner, block.fresh)
 
 
-def build_block(block: Block, workers: Workers, progress: Progress) -> None:
+def build_block(block: Block, submit: Callable[..., Any], progress: Progress) -> None:
     """Build the run of a block in a worker and throw it away, as `build_once` does here.
 
     Args:
         block: one run.
-        workers: processes of this machine.
+        submit: of workers that are processes of this machine.
         progress: called with the finished share of a training of networks.
 
     Raises:
@@ -223,9 +223,7 @@ def build_block(block: Block, workers: Workers, progress: Progress) -> None:
             case str(refusal):
                 refused.append(refusal)
 
-    if workers.submit is None:
-        raise ValueError("workers must have processes, got none")
-    workers.submit(_task(_build, block), hear).result()
+    submit(_task(_build, block), hear).result()
     if refused:
         raise ConfigurationError(refused[0])
 

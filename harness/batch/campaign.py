@@ -200,7 +200,7 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
-            build_block(Block((job,), offered(runs.sections)), place, observer.training)
+            build_block(Block((job,), offered(runs.sections)), place.submit, observer.training)
         else:
             build_once(job.run, observer.training)
     return sections
@@ -313,8 +313,7 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
         ConfigurationError: names the first of them and says why.
     """
     for assignment in settings.assigned:
-        why = _without_effect(assignment, examples, steps)
-        if why:
+        if why := _without_effect(assignment, examples, steps):
             raise ConfigurationError(f"--set {assignment.text} has no effect: {why}")
 
 
@@ -348,10 +347,8 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         here: manifest of the new batch.
     """
     here = json.loads(results.encode(here))
-    for key in NAMES:
-        if there.get(key) != here[key]:
-            return f"{key} {_short(there.get(key))} there, {_short(here[key])} here"
-    old, new = flatten(there.get("configuration", {})), flatten(here["configuration"])
+    old = {key: there.get(key) for key in NAMES} | flatten(there.get("configuration", {}))
+    new = {key: here[key] for key in NAMES} | flatten(here["configuration"])
     for key in dict.fromkeys([*old, *new]):
         if old.get(key) != new.get(key):
             return f"{key} {_short(old.get(key, 'unknown'))} there, {_short(new.get(key, 'unknown'))} here"

@@ -225,5 +225,4 @@ def _fault(folder: Path, name: str) -> str | None:
 def _log(folder: Path) -> str:
     """Return the log of failures as far as it can be made from the table of runs."""
     groups = tables.row_groups(folder, RUNS, LOGGED)
-    rows = (dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy())
-    return "".join(log_entry(row, "") for row in rows)
+    return "".join(log_entry(row, "") for group in groups for row in group.to_dict("records"))

@@ -98,13 +98,12 @@ def locked(folder: Path) -> Iterator[Lock]:
         descriptor, stale = _acquire(path)
     except OSError as error:
         raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
-    lock = Lock(path, descriptor, stale)
     try:
         with contextlib.suppress(OSError):  # a full disk does not keep the lock from being held
             if os.fstat(descriptor).st_nlink == 1:  # otherwise it is also a file elsewhere
                 os.ftruncate(descriptor, 0)
                 os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
-        yield lock
+        yield Lock(path, descriptor, stale)
     finally:
         with contextlib.suppress(OSError):  # the folder may be gone, or read-only by now
             if _same(path, descriptor):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import git_commit, installed_version
@@ -109,13 +109,7 @@ def describe_robot(name: str) -> dict[str, Any]:
     return {"name": name, "title": robot.title, "source": robot.source, "note": robot.note, **listed, **camera}
 
 
-MAPPING: Final = ".toml"
-SETTING: Final = "file"  # name of the settings that hold the name of a file
-
-
-def named_files(
-    runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer] = ()
-) -> dict[str, str]:
+def named_files(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]) -> dict[str, str]:
     """Return the SHA-256 of each file by its name, as the user wrote it.
 
     Args:
@@ -140,12 +134,12 @@ def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]]) -> Iter
         yield from () if camera is None else map(str, camera.files)
     yield from filter(None, (Mismatch.parse(text).calibration for text in runs.mismatches))
     for values in configuration.values():
-        yield from (str(value) for key, value in values.items() if key.split(".")[-1] == SETTING and value)
+        yield from (str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value)
     for name in (*runs.plants, *runs.controllers):
         if name.startswith(MAPPED):
             path = name.removeprefix(MAPPED)
             yield path
-            if path.endswith(MAPPING):
+            if path.endswith(".toml"):
                 yield str(Path(path).parent / str(read_toml("mapping", user_path(path)).get("file", "")))
 
 

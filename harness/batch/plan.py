@@ -13,7 +13,7 @@ import tomllib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from textwrap import shorten
 from typing import Any, Final, Generic, Self, TypeVar, overload
@@ -49,16 +49,12 @@ class Batch:
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
-        return Grid(_run, [self.robot], *self.axes())
 
-    def axes(self) -> tuple[Sequence[Any], ...]:
-        """Return sensing set-ups, plants, tasks, mismatches, controllers and seeds."""
+        def run(sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
+            return RunRequest(plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing)
+
         mismatches = [read_mismatch(text) for text in self.mismatches]
-        return self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
-
-
-def _run(robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
-    return RunRequest(plant, controller, task, mismatch, seed, robot=robot, sensing=sensing)
+        return Grid(run, self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds)
 
 
 def parse_seeds(text: str) -> Sequence[int]:
@@ -234,16 +230,14 @@ class SweepPlan:
             for text in self.batch.mismatches:
                 if axis in dict(read_mismatch(text).axes):
                     raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
+
+        def cell(place: Place, varied: Varied, request: RunRequest) -> Cell:
+            return Cell(replace(request, mismatch=place.vary(request.mismatch), varied=varied), place.columns)
+
         places = [Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes]
         names = [name for name, _ in self.settings]
         varied = Grid(lambda *values: tuple(zip(names, values, strict=True)), *(values for _, values in self.settings))
-        return Grid(_cell, places or [Place()], varied, [self.batch.robot], *self.batch.axes())
-
-
-def _cell(place: Place, varied: Varied, *own: Any) -> Cell:  # noqa: ANN401 - as those of `_run`
-    robot, sensing, plant, task, mismatch, controller, seed = own
-    request = RunRequest(plant, controller, task, place.vary(mismatch), seed, varied, robot, sensing)
-    return Cell(request, place.columns)
+        return Grid(cell, places or [Place()], varied, self.batch.requests())
 
 
 @dataclass(frozen=True)

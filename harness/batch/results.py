@@ -238,9 +238,8 @@ def unlisted(folder: Path) -> list[str]:
         for each in [each for each in inside if (Path(place) / each / MANIFEST).exists()]:
             names.append(f"{(Path(place) / each).relative_to(folder)}/")
             inside.remove(each)
-        if Path(place) == folder / PARTS:
-            continue
-        names += [f"{(Path(place) / each).relative_to(folder)}" for each in files if not PARTIAL.fullmatch(each)]
+        if Path(place) != folder / PARTS:
+            names += [f"{(Path(place) / each).relative_to(folder)}" for each in files if not PARTIAL.fullmatch(each)]
     return sorted(name for name in names if name not in sums and name not in (SUMS, LOCK))
 
 

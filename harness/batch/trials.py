@@ -35,8 +35,6 @@ PLANT: Final = "kinematic"  # on which controllers are tried
 TASK: Final = "exp1"
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
-LOADING: Final = "loading"  # the step before the first check
-OUTPUTS: Final = (1, 2)  # descriptors of standard output and error
 
 Word: TypeAlias = Literal["controller", "plant"]
 Checks: TypeAlias = Callable[..., Any]
@@ -112,7 +110,7 @@ def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool],
     function, arguments, quiet = argument
     if quiet:
         nothing = Path(os.devnull).open("w")  # noqa: SIM115 - open as long as the process lives
-        for descriptor in OUTPUTS:
+        for descriptor in (1, 2):  # standard output and error
             os.dup2(nothing.fileno(), descriptor)
         sys.stdout = sys.stderr = nothing
     tell(None)  # its time begins
@@ -212,7 +210,7 @@ def run_checks(checks: Checks, subject: str, limit: float, hear: Callable[[Findi
     Raises:
         ConfigurationError: the subject cannot be loaded.
     """
-    current = [LOADING]
+    current = ["loading"]  # the step before the first check
 
     def receive(told: object) -> None:
         match told:

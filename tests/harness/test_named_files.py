@@ -92,7 +92,7 @@ def refused(controllers, name, *, resume=False, **asked):
 def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():
     write({"cell/crane.toml": 'file = "../lib/crane.fmu"\n', "lib/crane.fmu": "1", "pilot.fmu": "2"})
     names = {"fmu:cell/crane.toml": None}, {"fmu:pilot.fmu": None, "constant": None}
-    found = named_files(Survey(plants=names[0], controllers=names[1]), {})
+    found = named_files(Survey(plants=names[0], controllers=names[1]), {}, ())
     assert list(found) == ["cell/crane.toml", "cell/../lib/crane.fmu", "pilot.fmu"]
     assert found["pilot.fmu"] == hashlib.sha256(b"2").hexdigest()
 

@@ -289,7 +289,7 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     assert row["sensing"] == f"{file}:hand"
     word = f"{file}:hand"
     assert describe_sensing(word) == {"name": word, "features": ["r", "y", "z"], "unit": "m", "cameras": 1}
-    files = named_files(Survey(sensings={word: None, "stereo:hand": None}), {})
+    files = named_files(Survey(sensings={word: None, "stereo:hand": None}), {}, ())
     assert files == {str(file): hashlib.sha256(OWN.encode()).hexdigest()}
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")

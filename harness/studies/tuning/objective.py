@@ -301,22 +301,18 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
     Raises:
         ConfigurationError: the file is no ledger, or one of other settings or runs.
     """
-    return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint(controller, runs))
-
-
-def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
-    """Return everything except the settings on which costs depend, as JSON."""
     constants = {
         "KINDS": KINDS, "LEVELS": LEVELS, "MODELS": MODELS, "TASKS": TASKS, "FLOOR": FLOOR,
         "MIN_DELAY_MARGIN": MIN_DELAY_MARGIN, "WORST": WORST,
     }  # fmt: skip
-    return {
+    fingerprint = {
         "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
         "objective": {name: repr(value) for name, value in constants.items()},
         "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
         "plants": list(runs.plants),
         "robots": [runs.robots, runs.offset],
     }
+    return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
 
 
 def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
