@@ -120,8 +120,7 @@ def _of_one_run(runs: pd.DataFrame) -> str:
 
 
 def _of_one_controller(runs: pd.DataFrame) -> str:
-    name = runs["controller"].iloc[0]
-    sentence = f"`{name}` {asked_of(runs)} in {_share(runs)}"
+    sentence = f"`{runs['controller'].iloc[0]}` {asked_of(runs)} in {_share(runs)}"
     moves, _ = split_tasks(runs)
     if len(moves) == len(runs) and settling_times(runs).notna().any():
         middle = median_with_interval(settling_times(runs))

@@ -33,10 +33,10 @@ END_TIME, END_PAUSE = 5.0, 0.01  # [s] until all processes below this one have e
 
 @dataclass(frozen=True)
 class Limits:
-    """Resources of a run; None for no limit."""
+    """Resources of a run; infinity for no limit."""
 
-    time: float | None = None  # [s] from one answer to the next
-    memory: int | None = None  # [bytes] of a run and the processes that it starts
+    time: float = math.inf  # [s] from one answer to the next
+    memory: float = math.inf  # [bytes] of a run and the processes that it starts
     addresses: bool = False  # refuse each process more than this memory at once, even if it never touches it
 
 
@@ -50,14 +50,11 @@ class Bounds:
 
     def limits(self, count: int, *, foreign: bool) -> Limits:
         """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
-        time, memory = self.run_timeout, self.run_memory
-        if foreign:
-            time = FOREIGN_TIME if time is None else time
-            share = FOREIGN_SHARE * psutil.virtual_memory().total / count
-            memory = max(LEAST_FOREIGN_MEMORY, share) if memory is None else memory
-        seconds = None if time is None or math.isinf(time) else time
-        size = None if memory is None or math.isinf(memory) else int(memory)
-        return Limits(seconds, size, addresses=self.run_memory is not None)
+        share = FOREIGN_SHARE * psutil.virtual_memory().total / count
+        usual = Limits(FOREIGN_TIME, max(LEAST_FOREIGN_MEMORY, share)) if foreign else Limits()
+        time = usual.time if self.run_timeout is None else self.run_timeout
+        memory = usual.memory if self.run_memory is None else self.run_memory
+        return Limits(time, memory, addresses=self.run_memory is not None)
 
 
 def available_processors() -> int:
@@ -151,15 +148,15 @@ def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noq
         return None
 
 
-def limit_resources(memory: int | None) -> None:
+def limit_resources(memory: float) -> None:
     """Write no image of the memory after a crash, and refuse this process more than `memory` further addresses.
 
     Not all addresses are memory: drivers of graphics cards reserve hundreds of gigabytes of them.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    if memory is not None and LINUX:
+    if memory < math.inf and LINUX:
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        soft = psutil.Process().memory_info().vms + memory
+        soft = psutil.Process().memory_info().vms + int(memory)
         if hard == resource.RLIM_INFINITY or soft < hard:
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
@@ -208,9 +205,9 @@ def read_size(text: str) -> float:
     return int(float(found[1]) * 1000 ** " KMGT".index(found[2].upper() or " "))
 
 
-def show_size(size: int) -> str:
+def show_size(size: float) -> str:
     """Return a number of bytes as a user writes it."""
     for unit, one in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if size >= one:
             return f"{size / one:.3g} {unit}"
-    return f"{size} B"
+    return f"{size:g} B"

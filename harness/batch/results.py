@@ -365,8 +365,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if is_expected(folder, MANIFEST):
         _refuse_damaged(folder, [MANIFEST])
     try:
-        text = (folder / MANIFEST).read_text(encoding="utf-8")
-        return decode(folder, MANIFEST, text)
+        return decode(folder, MANIFEST, (folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         why = f"its {MANIFEST} cannot be read" if folder.exists() else "it does not exist"
         raise ConfigurationError(f"{folder} is not a results folder: {why}") from error

@@ -179,7 +179,7 @@ class Sandbox:
         Raises:
             ConfigurationError: no process can be started.
         """
-        answer, limit = Answer(), math.inf if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
+        answer, limit = Answer(), max(self._limits.time, START_TIME) + GRACE
         silence = Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
         try:
             link = self._start()
@@ -355,8 +355,7 @@ class _Guard:
 
     def _watch(self, below: Connection) -> End | None:
         """Pass the answers of the runner on until it is done; return its premature end."""
-        limit = self._limits.time
-        patience, since = (None if limit is None else max(limit, START_TIME)), time.monotonic()
+        patience, since = max(self._limits.time, START_TIME), time.monotonic()
         while True:
             ready = wait([below, self._link], LOOK_EVERY)
             if below in ready:
@@ -366,11 +365,11 @@ class _Guard:
                 if message[:1] not in (ITEM, ALIVE):
                     return self._find_end()
                 self._answers += message[:1] == ITEM
-                patience, since = limit, time.monotonic()
+                patience, since = self._limits.time, time.monotonic()
                 self._link.send_bytes(message)
             elif self._link in ready:  # nobody sends a second task: the other side has ended
                 sys.exit(1)
-            elif patience is not None and time.monotonic() - since > patience:
+            elif time.monotonic() - since > patience:
                 with contextlib.suppress(OSError):
                     os.kill(self._runner.pid, signal.SIGUSR1)  # writes a trace
                     time.sleep(TRACE_TIME)
@@ -385,7 +384,7 @@ class _Guard:
         if len(below) > MAX_PROCESSES:
             return self._end(CRASHED, f"the run started more than {MAX_PROCESSES} processes")
         most = self._limits.memory
-        if most is not None and processes.resident_memory(below) > most and processes.own_memory(below) > most:
+        if processes.resident_memory(below) > most and processes.own_memory(below) > most:
             reason = f"the run held more than {show_size(most)} of memory"
             return self._end(OUT_OF_MEMORY, reason, certain=not self._answers)
         processes.collect_ended(each for each in below if each != self._runner.pid)
@@ -404,11 +403,10 @@ class _Guard:
 
     def _is_used_up(self, task: Task) -> bool:
         """Return whether a runner kept something that its next task should not meet."""
-        most = self._limits.memory
-        if not task.owner and most is None:
+        if not task.owner and self._limits.memory == math.inf:
             return False
         below = processes.descendants(os.getpid())
-        return len(below) > 1 or (most is not None and processes.resident_memory(below) > KEPT_SHARE * most)
+        return len(below) > 1 or processes.resident_memory(below) > KEPT_SHARE * self._limits.memory
 
     def end_runner(self) -> None:
         """End the runner and every process that runs have left behind."""
@@ -435,7 +433,7 @@ def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     with Path(os.devnull).open() as nothing:
         os.dup2(nothing.fileno(), 0)  # waiting for the keyboard ends at once
-    processes.limit_resources(limits.memory if limits.addresses else None)
+    processes.limit_resources(limits.memory if limits.addresses else math.inf)
     own = os.getpid()
 
     def tell(item: Any) -> None:  # noqa: ANN401 - JSON

@@ -125,8 +125,7 @@ def studies(
     some = robots[: max(2, 2 * seeds // 5)]
 
     def cells(controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]) -> tuple[Cell, ...]:
-        names = tuple(name + suffix for name in controllers)
-        batch = Batch(tuple(plants), names, tasks, (mismatch,), chosen)
+        batch = Batch(tuple(plants), tuple(name + suffix for name in controllers), tasks, (mismatch,), chosen)
         return tuple(Cell(request) for request in batch.requests())
 
     four = (PROPOSED, *OTHERS)
@@ -156,9 +155,8 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
     for name, table in own.items():
         if not (table["status"] == COMPLETED).any():
             raise ConfigurationError(f"no run of {name} on {plant} reached its last period")
-    rules = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)
     answers = [
-        *(rule(own, plant) for rule in rules),
+        *(rule(own, plant) for rule in (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)),
         _reading(own, plant, NO_EPSILON, "ε = 0", "reading: both step sizes without ε, as printed"),
         _reading(own, plant, ENTRIES, "entries", "reading: controller network fitted entry by entry"),
     ]

@@ -120,8 +120,7 @@ def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONG
         mismatch = request.mismatch if place.axis in (LATENCY, NOISE) else place.vary(request.mismatch)
         return Cell(replace(request, mismatch=mismatch, varied=known.get(place.axis, ())), place.columns)
 
-    places = [Place(line.axis, magnitude) for line in lines for magnitude in line.places]
-    return Grid(cell, places, batch.requests())
+    return Grid(cell, [Place(line.axis, magnitude) for line in lines for magnitude in line.places], batch.requests())
 
 
 def batch_of_map(

@@ -122,8 +122,7 @@ class TuningSet:
 
     def second(self) -> Self:
         """Return the second, larger set: other robots of the tuning range, which no trial uses."""
-        offset = (self.offset + SECOND_OFFSET) % len(TUNING)
-        return replace(self, robots=SECOND_FACTOR * self.robots, offset=offset)
+        return replace(self, robots=SECOND_FACTOR * self.robots, offset=(self.offset + SECOND_OFFSET) % len(TUNING))
 
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
@@ -138,8 +137,7 @@ class TuningSet:
                 world = run // self.robots
                 task, varied = KINDS[world]
                 own = *varied, *drives[world], *((key, level[key][world]) for key in ("noise", "latency"))
-                mismatch = read_mismatch(model + level["detector"][world])
-                runs.append(RunRequest(plant, "", task, mismatch, seed, own))
+                runs.append(RunRequest(plant, "", task, read_mismatch(model + level["detector"][world]), seed, own))
         return runs
 
     def _drawn(self, name: str, levels: Sequence[Any], count: int) -> list[Any]:
