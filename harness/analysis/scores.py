@@ -73,7 +73,8 @@ def ranking(table: pd.DataFrame) -> list[Ranked]:
     ends, apart = drawn.quantile([tail, 1.0 - tail]), _told_apart(means, drawn)
     found: list[Ranked] = []
     for place, name in enumerate(map(str, means.index), start=1):
-        estimate = Estimate(float(means[name]), *map(float, ends[name]), len(by_robot))
+        low, high = map(float, ends[name])
+        estimate = Estimate(float(means[name]), low, high, len(by_robot))
         shared = found and frozenset((found[found[-1].rank - 1].controller, name)) not in apart
         rank = found[-1].rank if shared else place
         found.append(Ranked(rank, name, estimate, float((by_robot[name] == 0.0).mean())))
@@ -120,10 +121,8 @@ def resolution(table: pd.DataFrame) -> float:
     for _ in range(SPLITS):
         order = generator.permutation(count)[numbers]
         shuffled = [own[np.argsort(order[own])] for own in rows]
-        first, second = (
-            _middle_means(values[:, np.concatenate(half)])
-            for half in ([own[: len(own) // 2] for own in shuffled], [own[len(own) // 2 :] for own in shuffled])
-        )
+        halves = zip(*((own[: len(own) // 2], own[len(own) // 2 :]) for own in shuffled), strict=True)
+        first, second = (_middle_means(values[:, np.concatenate(half)]) for half in halves)
         differences.append(np.abs(first - second))
     return float(np.median(differences))
 
@@ -155,10 +154,8 @@ def _means_with_resamples(by_robot: pd.DataFrame) -> tuple[pd.Series[float], pd.
     values, generator = np.ascontiguousarray(by_robot.to_numpy().T), np.random.default_rng(0)
     challenges = by_robot.index.get_level_values("challenge").to_numpy()
     rows = [np.flatnonzero(challenges == name) for name in dict.fromkeys(challenges)]
-    drawn = [
-        _middle_means(values[:, np.concatenate([generator.choice(own, len(own)) for own in rows])])
-        for _ in range(RESAMPLES)
-    ]
+    samples = (np.concatenate([generator.choice(own, len(own)) for own in rows]) for _ in range(RESAMPLES))
+    drawn = [_middle_means(values[:, sample]) for sample in samples]
     means = pd.Series(_middle_means(values), index=by_robot.columns).sort_values(ascending=False, kind="stable")
     return means, pd.DataFrame(drawn, columns=by_robot.columns)
 

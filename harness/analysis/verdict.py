@@ -173,19 +173,16 @@ def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
 def _standing(words: str, place: pd.DataFrame, own: pd.DataFrame) -> _Standing:
     order, against, metric = *_ranked(place, own), judged_metric(place)
     unit, factor = shown_unit(metric, place)
-    by_verdict = {
+    having = {
         verdict: tuple(name for name, each in against.items() if each.verdict == verdict)
         for verdict in ("equivalent", "undecided", "worse", "better")
     }
-    behind = next(iter(by_verdict["better"]), "")
+    behind = next(iter(having["better"]), "")
     small = factor * margin(metric, place)
     by = -against[behind].mean.value if behind and against[behind].mean.high < -small else math.nan
-    best = (order[0], *by_verdict["equivalent"])
+    best = (order[0], *having["equivalent"])
     equal = tuple(name for name in dict.fromkeys(own["controller"]) if name in best)
-    return _Standing(
-        words, equal, by_verdict["undecided"], by_verdict["worse"], behind, by,
-        metric, unit, small,
-    )  # fmt: skip
+    return _Standing(words, equal, having["undecided"], having["worse"], behind, by, metric, unit, small)
 
 
 def _clause(places: Sequence[_Standing], count: int) -> str:

@@ -23,6 +23,7 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
 from io import BytesIO
+from itertools import groupby, islice
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final, Self
@@ -111,17 +112,9 @@ def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[Offer, ..
         chunk: at most so many runs that go one by one are in a block.
         own: controllers and plants that users gave.
     """
-    gathered: list[Job] = []
-    for job in jobs:
-        most = chunk if job.kind is None else size
-        last = gathered[-1] if gathered else job
-        follows = job.index == last.index + 1 and job.kind == last.kind and job.owner == last.owner
-        if gathered and (len(gathered) >= most or not follows):
-            yield Block(tuple(gathered), own, last.kind is not None)
-            gathered = []
-        gathered.append(job)
-    if gathered:
-        yield Block(tuple(gathered), own, gathered[0].kind is not None)
+    for (_, kind, _), alike in groupby(enumerate(jobs), lambda at: (at[1].index - at[0], at[1].kind, at[1].owner)):
+        while gathered := tuple(job for _, job in islice(alike, chunk if kind is None else size)):
+            yield Block(gathered, own, kind is not None)
 
 
 def carry_out_blocks(

@@ -225,4 +225,5 @@ def _fault(folder: Path, name: str) -> str | None:
 def _log(folder: Path) -> str:
     """Return the log of failures as far as it can be made from the table of runs."""
     groups = tables.row_groups(folder, RUNS, LOGGED)
-    return "".join(log_entry(row, "") for group in groups for row in group.to_dict("records"))
+    rows = (dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy())
+    return "".join(log_entry(row, "") for row in rows)

@@ -112,11 +112,8 @@ class Challenge:
         robots = {methods: seeds, self.reference: seeds[: bounded or self.reference_seeds]}
         arm = with_camera(DEFAULT_ROBOT, Path(self.camera)) if self.camera else DEFAULT_ROBOT
         world = partial(Batch, tuple(plants) or self.plants, tasks=(self.task,), mismatches=(self.mismatch,), robot=arm)
-        return [
-            Cell(replace(request, varied=varied))
-            for names, own in robots.items()
-            for request in world(names, seeds=own).requests()
-        ]
+        requests = (request for names, own in robots.items() for request in world(names, seeds=own).requests())
+        return [Cell(replace(request, varied=varied)) for request in requests]
 
     def check(self) -> None:
         """Refuse a challenge that cannot be carried out or judged.

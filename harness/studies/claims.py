@@ -148,10 +148,8 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
         ConfigurationError: of a study, no run reached its last period, so that there is nothing to compare.
     """
     plain = {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
-    own = {
-        name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain})
-        for name, table in tables.items()
-    }
+    here = {name: table[table["plant"] == plant] for name, table in tables.items()}
+    own = {name: table.reset_index(drop=True).replace({"controller": plain}) for name, table in here.items()}
     for name, table in own.items():
         if not (table["status"] == COMPLETED).any():
             raise ConfigurationError(f"no run of {name} on {plant} reached its last period")
@@ -246,11 +244,9 @@ def _in_words(ratio: float) -> str:
 
 
 def _keeps_up(tables: Tables, plant: str) -> Answer:
-    online, frozen = (
-        table[table["controller"] == PROPOSED].set_index(["task", "seed"])["jacobian_error_mean"]
-        for table in (tables[MAIN], tables[FROZEN])
-    )
-    both = pd.DataFrame({"online": online, "frozen": frozen}).dropna()
+    compared = {"online": tables[MAIN], "frozen": tables[FROZEN]}
+    runs = {name: each[each["controller"] == PROPOSED].set_index(["task", "seed"]) for name, each in compared.items()}
+    both = pd.DataFrame({name: own["jacobian_error_mean"] for name, own in runs.items()}).dropna()
     small, panel = margin("jacobian_error_mean", tables[MAIN]), "Jacobian error, online − as trained, mean, %"
     measured, levels, words = [], [], []
     for task in (*MOVES, CIRCLE):
@@ -272,11 +268,8 @@ def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) 
         times = settling_times(moves)
         share, time = success_rate(int(times.notna().sum()), len(moves)), median_with_interval(times)
         lap = circle_error(table, PROPOSED, kind)
-        measured += [
-            Measurement("moves that settled, share", "moves", kind, share),
-            Measurement("settling time, median, s", "moves", kind, time),
-            lap,
-        ]
+        measured.append(Measurement("moves that settled, share", "moves", kind, share))
+        measured += [Measurement("settling time, median, s", "moves", kind, time), lap]
         words.append(f"{kind}: settled {100 * share.value:.0f} %, median {time:.2f} s, circle {lap.estimate:.1f} mm")
         settled.append(times)
     found = paired_difference(*settled[1].align(settled[0], join="inner"), margin("settling_time_s", usual))

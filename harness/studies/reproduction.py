@@ -179,11 +179,7 @@ def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
 
     In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
     """
-    others = [
-        other.plant
-        for other in answers
-        if (other.claim, other.division) == (answer.claim, answer.division)
-        and other.verdict.partition(":")[0] != answer.verdict.partition(":")[0]
-        and UNDECIDED not in (other.verdict, answer.verdict)
-    ]
+    same = [other for other in answers if (other.claim, other.division) == (answer.claim, answer.division)]
+    verdicts, own = {other.plant: other.verdict.partition(":")[0] for other in same}, answer.verdict.partition(":")[0]
+    others = [plant for plant, verdict in verdicts.items() if verdict != own and UNDECIDED not in (verdict, own)]
     return f" (otherwise on {', '.join(others)})" if others else ""

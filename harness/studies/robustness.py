@@ -124,14 +124,10 @@ def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONG
 
 
 def batch_of_map(
-    plant: str,
-    controllers: Sequence[str],
-    seeds: Sequence[int],
-    robot: str = DEFAULT_ROBOT,
-    sensing: str = DEFAULT_SENSING,
+    plant: str, names: Sequence[str], seeds: Sequence[int], robot: str = DEFAULT_ROBOT, sensing: str = DEFAULT_SENSING
 ) -> Batch:
     """Return the runs at one place of a map: one robot for each seed, all methods, and the axis not varied yet."""
-    return Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot, (sensing,))
+    return Batch((plant,), tuple(names), (TASK,), (BASE,), seeds, robot, (sensing,))
 
 
 def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines: Sequence[Line] = LINES) -> list[Path]:

@@ -123,7 +123,8 @@ class Rest:
     def observation(self, feature: FloatArray, joint_position: FloatArray, after: float = 0.0) -> Observation:
         """Return the observation of other values, (..., m) and (..., n), `after` [s] later."""
         seen = np.full(feature.shape, fill_value=True)
-        return trusted_observation(self.time + after, joint_position, feature, seen.all(axis=-1), seen)
+        valid: Any = seen.all(axis=-1)
+        return trusted_observation(self.time + after, joint_position, feature, valid, seen)
 
     def reference(self, feature: FloatArray) -> FloatArray:
         """Return the constant reference (..., 1 + preview, m) at a desired feature, (..., m)."""

@@ -343,7 +343,7 @@ class Check:
 
     def changes(self) -> list[Change]:
         """Return every change whose scores are known."""
-        known = [(change, *map(ledger.costs, both)) for ledger, both, change in self._changes]
+        known = [(change, ledger.costs(both[0]), ledger.costs(both[1])) for ledger, both, change in self._changes]
         return [change(score(before), score(after)) for change, before, after in known if before and after]
 
 

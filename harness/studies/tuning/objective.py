@@ -248,12 +248,10 @@ class Ledger:
             self._size = content.rfind(b"\n") + 1
             header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
-        parts = [key for key in self._fingerprint if not isinstance(header, dict)
-                 or header.get(key) != self._fingerprint[key]]  # fmt: skip
+        known = header if isinstance(header, dict) else {}
+        parts = ", ".join(key for key, value in self._fingerprint.items() if known.get(key) != value)
         if parts:
-            raise ConfigurationError(
-                f"study {self.path} was made with other {', '.join(parts)}; name another folder with --out"
-            )
+            raise ConfigurationError(f"study {self.path} was made with other {parts}; name another folder with --out")
 
     def __len__(self) -> int:
         """Return the number of scored points."""
