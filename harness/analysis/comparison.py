@@ -387,13 +387,11 @@ def margin(name: str, runs: pd.DataFrame) -> float:
     For a time that is one control period; for an error 0.2 mm, as a share of the settling band, or a tenth of the
     median of the best controller that knows the robot if that is more; for a share or ratio 0.01; else 0.
     """
-    unit = METRICS[name].unit if name in METRICS else None
+    unit = METRICS[name].unit if name in METRICS else "unknown"
     if unit == "s":
         return float(column_of(runs, "period_s").fillna(RunSettings.period).max())
     if unit:
         return SHARE_MARGIN if unit == "1" else 0.0
-    if unit is None:
-        return 0.0
     bounds = runs[runs["controller"].isin([each for each in runs["controller"].unique() if knows_truth(str(each))])]
     best = column_of(bounds, name).groupby(bounds["controller"]).median().min()
     return float(np.nan_to_num(np.fmax(ERROR_MARGIN * column_of(runs, "settling_band").max(), BOUND_MARGIN * best)))

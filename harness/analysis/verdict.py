@@ -40,8 +40,6 @@ RIVALS: Final = "not shown to be behind the first"  # heading of a column
 NAMED, MANY = 3, 6  # controllers that a sentence names at most
 MOST_PLACES: Final = 24  # for which leaders are named
 
-Place = tuple[str, pd.DataFrame]  # words, runs
-
 
 @dataclass(frozen=True)
 class Verdict:

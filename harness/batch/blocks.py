@@ -87,11 +87,6 @@ class Block:
     together: bool = False  # whether the runs advance together
     fresh: bool = False  # whether they want a process in which no run has been
 
-    @property
-    def index(self) -> int:
-        """Index of the first run."""
-        return self.jobs[0].index
-
     def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Self:
         """Return some of the runs as a block."""
         return replace(self, jobs=self.jobs[begin:end], fresh=fresh)

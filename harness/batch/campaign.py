@@ -7,9 +7,10 @@ when they are needed, so that the memory of this process does not grow with thei
 """
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -37,7 +38,7 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.batch.tables import writing
 from servobench.harness.config.registry import Offer, offered
-from servobench.harness.config.settings import Assignment, Settings, flatten
+from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
@@ -47,6 +48,7 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
+_MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> another, and its values that leave it idle
@@ -153,8 +155,9 @@ def _carry_out_at(
     """Check and carry out a campaign at a place."""
     how = replace(how, block=1) if campaign.timed else how
     sections = check_campaign(campaign, runs, how.observer, place)
-    jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
-    side_by_side = jobs.side_by_side(runs.examples)
+    together = how.block > 1 and not how.debug and not campaign.steps
+    jobs = partial(_jobs, campaign, sections, together)
+    side_by_side = _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
     manifest = describe_batch(runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
@@ -175,7 +178,7 @@ def _carry_out_at(
             for block, outcome in _carry_out_missing(campaign, jobs, own, folder, place, how):
                 with writing(folder):
                     lock.check()  # the folder may have been removed
-                results.write_part(folder, block.index, outcome, manifest["campaign"])
+                results.write_part(folder, block.jobs[0].index, outcome, manifest["campaign"])
                 how.observer.finished([result.row for result in outcome])
         results.put_together(folder, manifest)
 
@@ -258,35 +261,25 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
         return results.put_together(out, manifest)
 
 
-class _Jobs:
-    """Makes the jobs of a campaign; runs that differ in seed only share their settings."""
+def _jobs(campaign: Campaign, sections: Sections, together: bool, indices: Iterable[int]) -> Iterator[Job]:
+    """Yield the jobs of some cells; runs that differ in seed only share their settings, and may advance together."""
+    for index in indices:
+        cell = campaign.cells[index]
+        run = select(cell.request, sections)
+        yield Job(index, cell, run, side_by_side_key(run) if together and not cell.picture else None)
 
-    def __init__(self, campaign: Campaign, sections: Sections, *, together: bool) -> None:
-        self._cells, self._sections = campaign.cells, sections
-        self._together = together and not campaign.steps
 
-    def at(self, indices: Iterable[int]) -> Iterator[Job]:
-        """Yield the jobs of some cells."""
-        for index in indices:
-            cell = self._cells[index]
-            run = select(cell.request, self._sections)
-            yield Job(index, cell, run, None if cell.picture else self._kind(run))
-
-    def side_by_side(self, examples: Iterable[RunRequest]) -> dict[str, list[str]]:
-        """Return by plant the controllers whose runs advance together."""
-        found: dict[str, dict[str, None]] = {}
-        for request in examples:
-            if self._kind(select(request, self._sections)) is not None:
-                found.setdefault(request.plant, {})[request.controller] = None
-        return {plant: list(controllers) for plant, controllers in found.items()}
-
-    def _kind(self, run: ResolvedRun) -> Hashable | None:
-        """Return the kind of a run if it may advance with others of its kind."""
-        return side_by_side_key(run) if self._together else None
+def _side_by_side(runs: Iterable[ResolvedRun]) -> dict[str, list[str]]:
+    """Return by plant the controllers of those of some runs that advance together."""
+    found: dict[str, dict[str, None]] = {}
+    for run in runs:
+        if side_by_side_key(run) is not None:
+            found.setdefault(run.request.plant, {})[run.request.controller] = None
+    return {plant: list(controllers) for plant, controllers in found.items()}
 
 
 def _carry_out_missing(
-    campaign: Campaign, jobs: _Jobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
+    campaign: Campaign, jobs: _MakeJobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out the runs whose part is not in the folder; yield each block with its results."""
     begin, end = (len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0]))
@@ -296,7 +289,7 @@ def _carry_out_missing(
     ends = [range(begin, begin), *done, range(end, end)]
     gaps = (range(one.stop, next_one.start) for one, next_one in pairwise(ends))
     size = even_size(missing, place.count, how.block)
-    blocks = cut(jobs.at(chain.from_iterable(gaps)), size, 1 if campaign.steps else CHUNK, own)
+    blocks = cut(jobs(chain.from_iterable(gaps)), size, 1 if campaign.steps else CHUNK, own)
     keep = folder if campaign.steps and not place.cluster else None
     return carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug)
 
@@ -312,21 +305,17 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
     Raises:
         ConfigurationError: names the first of them and says why.
     """
-    for assignment in settings.assigned:
-        if why := _without_effect(assignment, examples, steps):
-            raise ConfigurationError(f"--set {assignment.text} has no effect: {why}")
-
-
-def _without_effect(assignment: Assignment, examples: Iterable[RunRequest], steps: bool) -> str:
-    key = f"{assignment.section}.{assignment.key}"
-    own = [run for run in examples if assignment.section in ("run", run.plant, run.controller, run.task)]
-    if own and all(run.varies(key) for run in own):
-        return f"all runs vary {key}"
-    if key == "run.full_jacobian" and not steps:
-        return "this command keeps no steps, which hold the Jacobians"
-    if key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
-        return "no mismatch moves the camera, as camera_move=90deg does"
-    return ""
+    for section, name, text in settings.assigned:
+        key, why = f"{section}.{name}", ""
+        own = [run for run in examples if section in ("run", run.plant, run.controller, run.task)]
+        if own and all(run.varies(key) for run in own):
+            why = f"all runs vary {key}"
+        elif key == "run.full_jacobian" and not steps:
+            why = "this command keeps no steps, which hold the Jacobians"
+        elif key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
+            why = "no mismatch moves the camera, as camera_move=90deg does"
+        if why:
+            raise ConfigurationError(f"--set {text} has no effect: {why}")
 
 
 def _remark_on_idle(settings: Settings, runs: Iterable[ResolvedRun]) -> None:

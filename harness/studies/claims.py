@@ -55,7 +55,6 @@ MOVES: Final = ("exp1", "exp2", "exp3", "exp4")
 LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in which networks are trained
 STAYING: Final = ("exp2", "exp3")
 CIRCLE: Final = "circle"
-MISMATCH: Final = "moderate"
 DIVISIONS: Final[Mapping[str, str]] = {  # equipment of the methods -> suffix of their names
     "best equipped": "",
     "as published": PUBLISHED,
@@ -108,9 +107,7 @@ class Answer:
         return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
 
 
-def studies(
-    plants: Sequence[str], seeds: int, division: str = "best equipped", mismatch: str = MISMATCH
-) -> dict[str, Campaign]:
+def studies(plants: Sequence[str], seeds: int, division: str, mismatch: str) -> dict[str, Campaign]:
     """Return the studies by name on `plants`: `seeds` robots for each move, two fifths of them for the circle.
 
     Args:

@@ -70,8 +70,6 @@ LINES: Final = (
     Line(NOISE, "sensor noise [times the usual]", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
     Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
 )
-
-
 SENSOR_LINES: Final = (
     Line("mixture", "noise displaced to one side [%]", parse_magnitudes("mixture", "0:20:5%")),
     Line("bimodal", "noise displaced to either side [%]", parse_magnitudes("bimodal", "0:20:5%")),
@@ -86,8 +84,6 @@ SENSOR_LINES: Final = (
     Line("latency_swing", "latency swinging by [ms]", parse_magnitudes("latency_swing", "0:200:50ms")),
     Line("camera_turn", "camera turning by [°/s]", parse_magnitudes("camera_turn", "0:15:5deg")),
 )
-
-
 KNOWN_LINES: Final = {line.axis: line for line in (*LINES, *SENSOR_LINES)}
 
 

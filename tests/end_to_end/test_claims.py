@@ -229,13 +229,15 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
     usual = answer_all(tables(settling_time_s=proposed(-0.5)), "kinematic")
     assert [(a.verdict, a.evidence) for a in answers] == [(a.verdict, a.evidence) for a in usual]
     names = {
-        cell.request.controller for study in studies(["kinematic"], 6, "as published").values() for cell in study.cells
+        cell.request.controller
+        for study in studies(["kinematic"], 6, "as published", "moderate").values()
+        for cell in study.cells
     }
     assert names == {f"{name}:published" for name in METHODS}
 
 
 def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(monkeypatch, capsys, tmp_path):
-    made = studies(["kinematic"], 6, mismatch="lab")
+    made = studies(["kinematic"], 6, "best equipped", "lab")
     assert all("-lab-" in cell.request.run_id for study in made.values() for cell in study.cells)
     wrong = ("claims", "--plants", "kinematic", "--seeds", "6", "--mismatch", "labs", "--out", str(tmp_path / "out"))
     assert servobench(monkeypatch, *wrong) == 2
@@ -253,7 +255,7 @@ def test_every_answer_is_in_the_tables_and_has_a_figure(tmp_path):
 
 
 def test_no_study_uses_a_seed_that_methods_were_tuned_on():
-    for study in studies(["kinematic"], 400).values():
+    for study in studies(["kinematic"], 400, "best equipped", "moderate").values():
         seeds = {cell.request.seed for cell in study.cells}
         assert not seeds & set(TUNING)
         assert min(seeds) == FIRST_SEED

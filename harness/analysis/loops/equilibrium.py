@@ -38,7 +38,6 @@ from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]
-SOURCES: tuple[Source, ...] = ("true", "nominal", "estimated")
 WARM_UP = 3.0  # [s] of a move after any probing, in which aids identify delay, response and noise
 SETTLING_PERIODS = 40  # of rest, after which histories and filters hold the rest only
 PLANT = "kinematic"
@@ -97,18 +96,16 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
 
     Of the past joint positions only those are kept that the present delay needs.
     """
-    other, pairing, estimation = copy.copy(servo), servo.estimation.pairing, state.estimation
-    learned = estimation.learned._replace(estimator=None, anchor=None)  # they may be large
-    estimation = estimation._replace(learned=learned)
+    other, pairing = copy.copy(servo), servo.estimation.pairing
+    learned = state.estimation.learned._replace(estimator=None, anchor=None)  # they may be large
     other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
     if pairing is not None:
-        pair = estimation.learned.pair
+        pair = learned.pair
         other.predictor = None if servo.predictor is None else servo.predictor.frozen(float(pair.regression.share))
         window = 0 if servo.predictor is None else servo.predictor.window
         rows = max(int(pairing.delay(pair)) + 4, window + 1)
-        learned = estimation.learned._replace(pair=pair._replace(past=pair.past[:rows]))
-        estimation = estimation._replace(learned=learned)
-    return other, state._replace(estimation=estimation)
+        learned = learned._replace(pair=pair._replace(past=pair.past[:rows]))
+    return other, state._replace(estimation=state.estimation._replace(learned=learned))
 
 
 @dataclass(frozen=True, eq=False)

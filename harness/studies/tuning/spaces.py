@@ -24,8 +24,9 @@ repeated with the scores of the ledger up to where it stopped. There is no pruni
 
 import math
 import warnings
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -61,10 +62,7 @@ LIMITS: Final[Mapping[str, float]] = {
 """Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
 
-def _log(low: float, high: float) -> FloatDistribution:
-    return FloatDistribution(low, high, log=True)
-
-
+_log: Final = partial(FloatDistribution, log=True)
 _SWITCH: Final = CategoricalDistribution((False, True))
 _AIDS: Final[Space] = {
     **{f"aids.{name}": CategoricalDistribution(aid.tuned) for name, aid in SWITCHES.items() if aid.tuned},  # type: ignore[arg-type]
@@ -116,8 +114,6 @@ _CFDL: Final[Space] = {
     "estimator.step_factor": FloatDistribution(0.05, 1.9),
     "estimator.regularisation": _log(1e-5, 0.1),  # rad²
 }
-
-
 _MPC_AIDS: Final = {key: each for key, each in _AIDS.items() if key not in ("aids.feedforward", "aids.limit")}
 _MPC_SWITCHES: Final[Space] = {"law.mode": CategoricalDistribution(("constant", "moves")), "law.use_preview": _SWITCH}
 _START: Final[Space] = {"initial.source": CategoricalDistribution(("nominal", "probe"))}
@@ -350,7 +346,11 @@ def first_points(name: str) -> list[Point]:
     entry, space = find_tunable(name), find_space(name)
     default, own = default_values(entry), tuned_point(entry)
     flips = [point for _, point in neighbours(_switches(space), default)]
-    points = [default, own, *flips, *_borrowed(name, own)]
+    points = [default, own, *flips]
+    for other in SPACES:
+        shared = {key: value for key, value in flatten(tuned_settings(other)).items() if key in space}
+        if shared and other != name:
+            points.append(inside(space, {**own, **shared}, own))
     return list({str(nested_settings(point)): point for point in points}.values())
 
 
@@ -362,16 +362,6 @@ def tuned_point(entry: ControllerEntry) -> Point:
     except ConfigurationError:
         return default  # a file of an earlier version
     return inside(find_space(entry.name), values, default) if settings else default
-
-
-def _borrowed(name: str, own: Point) -> Iterator[Point]:
-    """Yield starting points that reuse another method's tuned values for shared settings."""
-    space = find_space(name)
-    for other in SPACES:
-        settings = {} if other == name else tuned_settings(other)
-        shared = {key: value for key, value in flatten(settings).items() if key in space}
-        if shared:
-            yield inside(space, {**own, **shared}, own)
 
 
 def inside(space: Space, values: Point, otherwise: Point) -> Point:
