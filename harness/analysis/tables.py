@@ -337,8 +337,7 @@ def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the shares of outcomes [%] of each condition, task and controller of which a run failed."""
-    named = runs.assign(outcome=outcomes(runs))
-    rows = _rows(named, [*_varied(runs), "task"])
+    rows = _rows(runs.assign(outcome=outcomes(runs)), [*_varied(runs), "task"])
     mixed = [(row, own) for row, own in rows if not own["outcome"].isin(ACHIEVED).all()]
     found = {str(word) for _, own in mixed for word in own["outcome"]}
     table = []

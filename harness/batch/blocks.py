@@ -308,7 +308,7 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
     own = (identity.keys() | cell.columns.keys()) - {"robot", "engine"}
-    if any(_differ(known[name], row[name]) for name in own):
+    if any(json.dumps(known[name]) != json.dumps(row[name]) for name in own):  # NaN is NaN, and 1 not 1.0 or true
         raise ValueError("it is that of another run")
     for name, value in row.items():
         usual = str if name in TEXTS else float
@@ -325,11 +325,6 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
     return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
-
-
-def _differ(wanted: object, came: object) -> bool:
-    """Return whether two JSON values differ, NaN being equal to itself and 1 unlike 1.0 and true."""
-    return came != wanted if isinstance(wanted, str) else json.dumps(came) != json.dumps(wanted)
 
 
 def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:

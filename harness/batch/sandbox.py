@@ -412,11 +412,9 @@ class _Guard:
         """End the runner and every process that runs have left behind."""
         if self._below is not None:
             self._below.close()
-            self._below = None
-        if self._runner is not None:
             self._runner.kill()
             self._runner.join(processes.END_TIME)
-            self._runner = None
+            self._below = self._runner = None
         processes.end_descendants()
 
 

@@ -9,10 +9,9 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from servobench.harness.batch.processes import FOREIGN_TIME, Bounds
 from servobench.harness.batch.sandbox import LOST, Tell, call
@@ -40,8 +39,7 @@ Word: TypeAlias = Literal["controller", "plant"]
 Checks: TypeAlias = Callable[..., Any]
 
 
-@dataclass(frozen=True)
-class Tried:
+class Tried(NamedTuple):
     """A controller or plant with the result of its trial."""
 
     name: str  # by which it is found
@@ -71,13 +69,13 @@ def attempt(
     *arguments: object,
     limit: float,
     why: Callable[[Ending, float], str] = explain,
-    hear: Tell = lambda _: None,
+    hear: Tell | None = None,
     quiet: bool = True,
 ) -> tuple[Any, str]:
     """Call a function with code of users in a sandbox.
 
     Args:
-        function: takes `tell` and the arguments, and returns JSON values.
+        function: takes the arguments, and `tell` before them if it is heard, and returns JSON values.
         arguments: can be pickled.
         limit: [s] from one message to the next.
         why: says why the function did not return, from the end of its process.
@@ -94,20 +92,22 @@ def attempt(
 
     def receive(message: object) -> None:
         match message:
-            case ["told", told]:
+            case ["told", told] if hear is not None:
                 hear(told)
             case ["answer" | "refusal" | "failure" as part, value]:
                 found[part] = value
 
-    end = call(_attempt_here, (function, arguments, quiet), Bounds(limit).limits(1, foreign=True), receive)
+    end = call(
+        _attempt_here, (function, arguments, quiet, hear is not None), Bounds(limit).limits(1, foreign=True), receive
+    )
     if "refusal" in found:
         raise ConfigurationError(str(found["refusal"]))
     return found.get("answer"), str(found.get("failure", "")) if end is None else why(end, limit)
 
 
-def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool], tell: Tell) -> None:
+def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool, bool], tell: Tell) -> None:
     """Call a function in this process."""
-    function, arguments, quiet = argument
+    function, arguments, quiet, heard = argument
     if quiet:
         nothing = Path(os.devnull).open("w")  # noqa: SIM115 - open as long as the process lives
         for descriptor in (1, 2):  # standard output and error
@@ -115,7 +115,7 @@ def _attempt_here(argument: tuple[Callable[..., Any], tuple[object, ...], bool],
         sys.stdout = sys.stderr = nothing
     tell(None)  # its time begins
     try:
-        tell(["answer", function(lambda told: tell(["told", told]), *arguments)])
+        tell(["answer", function(*[lambda told: tell(["told", told])] * heard, *arguments)])
     except ConfigurationError as error:
         tell(["refusal", str(error)])
     except BaseException as error:  # noqa: BLE001 - code of users may raise anything
@@ -140,7 +140,7 @@ def choose(word: Word, given: str) -> str:
     return registry.choose(given)
 
 
-def _choose(_tell: Tell, word: Word, given: str) -> str:
+def _choose(word: Word, given: str) -> str:
     return REGISTRIES[word].choose(given)
 
 
@@ -169,19 +169,14 @@ def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
 def _try(word: Word, point: EntryPoint, robot: str) -> Tried:
     """Try one in a sandbox."""
     try:
-        answer, why = attempt(_try_there, word, point.name, robot, limit=TRIAL_LIMIT)
+        answer, why = attempt(_try_here, word, point.name, robot, limit=TRIAL_LIMIT)
     except ConfigurationError as error:  # which such code may falsify
         answer, why = None, str(error)
     match answer:
-        case [str(summary), str(fault)]:
+        case [_, str(summary), str(fault)]:
             return Tried(point.name, summary, fault)
     why = why or "it gave no answer"
     return Tried(point.name, fault=f"{word} {point.name!r} ({point.value}) cannot be used: {why}")
-
-
-def _try_there(_tell: Tell, word: Word, name: str, robot: str) -> tuple[str, str]:
-    tried = _try_here(word, name, robot)
-    return tried.summary, tried.fault
 
 
 def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
@@ -243,7 +238,7 @@ def validate(path: Path) -> Validation:
     return Validation((f"the reference run ended: {failure or 'it gave no answer'}",), None)
 
 
-def _validate(_tell: Tell, path: Path) -> tuple[Sequence[str], float | None]:
+def _validate(path: Path) -> tuple[Sequence[str], float | None]:
     from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
 
     with configuration_errors("", FmuError):

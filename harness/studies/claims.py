@@ -159,8 +159,7 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
 
 
 def _faster(tables: Tables, plant: str) -> Answer:
-    panel = "settling time, proposed − rival, mean, s"
-    compared = pairings(tables[MAIN], "settling_time_s", panel, "better")
+    compared = pairings(tables[MAIN], "settling_time_s", "settling time, proposed − rival, mean, s", "better")
     middles = medians(tables[MAIN], "settling time, median, s")
     words = "; ".join(
         f"{task} " + ", ".join(f"{m.label} {_seconds(m.estimate.value)}" for m in middles if m.place == task)

@@ -10,11 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, TypeAlias
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import (
     Estimate,
@@ -50,6 +51,7 @@ NOTE: Final = 115  # letters of a line below it
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"
 NOISE: Final = "noise"
+Measure: TypeAlias = Callable[[pd.DataFrame], Estimate]  # of the runs at a place
 
 
 @dataclass(frozen=True)
@@ -97,14 +99,6 @@ def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:
         if axis not in KNOWN_LINES:
             raise ConfigurationError(f"the map has no axis {axis!r}: {suggest(axis, KNOWN_LINES)}")
     return tuple(line for line in KNOWN_LINES.values() if line.axis in axes) or LINES
-
-
-class Scale(NamedTuple):
-    """The quantity that a picture of the map shows."""
-
-    measure: Callable[[pd.DataFrame], Estimate]  # of the runs at a place
-    label: str
-    top: float  # upper edge of the panels
 
 
 def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONGER) -> Grid[Cell]:
@@ -202,9 +196,9 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | Non
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
     arrived = f"Runs that came within {settling_band(runs)} and stayed"
     took = "Median settling time, from the move where the camera moves"
-    share, time = Scale(settled_share, "settled runs [%]", 104.0), Scale(settling_median, "settling time [s]", 10.0)
-    files = _draw(runs, folder / "robustness", arrived, share, limits or {})
-    return files + _draw(runs, folder / "robustness_settling", took, time, limits or {})
+    share = _draw(runs, limits or {}, settled_share, arrived, "settled runs [%]", 104.0)
+    time = _draw(runs, limits or {}, settling_median, took, "settling time [s]", 10.0)
+    return style.save_figure(share, folder / "robustness") + style.save_figure(time, folder / "robustness_settling")
 
 
 def settling_median(runs: pd.DataFrame) -> Estimate:
@@ -216,7 +210,10 @@ def settling_median(runs: pd.DataFrame) -> Estimate:
     return median_with_interval((settling_times(runs) - begin).clip(lower=0.0))
 
 
-def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapping[str, float]) -> list[Path]:
+def _draw(
+    runs: pd.DataFrame, limits: Mapping[str, float], measure: Measure, title: str, label: str, top: float
+) -> Figure:
+    """Draw a measure of the runs at each place of the map, with a title, its label and the upper edge of the panels."""
     controllers = list(dict.fromkeys(runs["controller"]))
     styles = style.method_styles(controllers)
     curves: dict[str, Curves] = {}
@@ -224,19 +221,19 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
         if axis in set(runs["axis"]):
             cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
             numbers = [place.number for place in line.places]
-            curves[axis] = {name: [scale.measure(cells[name, each]) for each in numbers] for name in controllers}
+            curves[axis] = {name: [measure(cells[name, each]) for each in numbers] for name in controllers}
     flat = [axis for axis in curves if _is_flat(curves[axis])]
     lines = [KNOWN_LINES[axis] for axis in curves if axis not in flat or len(flat) == len(curves)]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with style.figure_style(style.TEXT):
         figure, panels = style.panel_grid(len(lines), 1.9, head=1.5)
         for axes, line in zip(panels, lines, strict=True):
-            draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, scale.top)
+            draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, top)
             axes.set_xticks([place.number for place in line.places])
             axes.set_xlabel(line.title)
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
-        style.label_rows(panels, scale.label)
+        style.label_rows(panels, label)
         arm = runs["robot"].iloc[0] if "robot" in runs else DEFAULT_ROBOT  # folders of 0.1.0 have no such column
         which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
         notes = [f"{robots} {which}, bands are 95 % intervals"]
@@ -247,7 +244,7 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
         words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
         figure.suptitle(f"{title}\n{words}", fontsize=style.TEXT + 0.5)
         style.add_legend(figure, panels)
-    return style.save_figure(figure, stem)
+    return figure
 
 
 def _is_flat(curves: Curves) -> bool:
