@@ -302,9 +302,8 @@ def pairings(runs: pd.DataFrame, metric: str, panel: str, wanted: Verdict, facto
 
 def by_seed(runs: pd.DataFrame, task: str, metric: str) -> pd.DataFrame:
     """Return `metric` by seed and controller; NaN where a run has none or did not complete."""
-    own = runs[runs["task"] == task]
-    own = own.assign(value=own[metric].where(own["status"] == COMPLETED))
-    return own.pivot(index="seed", columns="controller", values="value")
+    known = runs.assign(value=runs[metric].where(runs["status"] == COMPLETED))
+    return known[known["task"] == task].pivot(index="seed", columns="controller", values="value")
 
 
 def medians(runs: pd.DataFrame, panel: str) -> list[Measurement]:

@@ -154,8 +154,7 @@ def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str 
 
     The prediction is that of small motions of the nominal robot, of the plant `kinematic`, without mismatch.
     """
-    line = next(line for line in LINES if line.axis == LATENCY)
-    latencies = [place.number / 1000.0 for place in line.places]
+    latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
     run, plant = settings.resolve("run", RunSettings()), settings.resolve("kinematic", KinematicConfig())
     limits: dict[str, float] = {}
     for name in controllers:

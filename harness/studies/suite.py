@@ -144,8 +144,7 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield f"{name!s} ({grade}) on {plant!s}: {titles[name]}; {bound}", place[list(heads)].rename(columns=heads)
     if ranks := ranking_rows(judged):
         for plant, place in as_text(ranks).groupby("plant", sort=False):
-            own = bounded(judged)
-            own = own[own["plant"] == plant]
+            own = bounded(judged[judged["plant"] == plant])
             title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
                 title += f"; halves of the robots differ by {resolution(own):.3f} in the score"

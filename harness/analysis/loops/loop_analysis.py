@@ -13,7 +13,7 @@ feedforward of it does not pass for feedback. Adaptation in the small motions is
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple, final
+from typing import Any, Final, NamedTuple, TypeAlias, final
 
 import numpy as np
 import pandas as pd
@@ -47,6 +47,7 @@ from servobench.plant.contract.signals import Command, Observation, Truth
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
 
+AnyConfig: TypeAlias = Any  # settings of any composed controller
 LENGTH = 256  # [periods] of the multisine
 AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine
 SETTLING = 100  # [periods] of rest before the experiments
@@ -282,7 +283,7 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
 
 
 def delay_margin(
-    config: Any,  # noqa: ANN401 - the settings of any composed controller
+    config: AnyConfig,
     name: str,
     run: RunSettings | None = None,
     plant: KinematicConfig | None = None,
@@ -322,12 +323,7 @@ def delay_margin(
 
 
 def latency_border(
-    config: Any,  # noqa: ANN401 - the settings of any composed controller
-    name: str,
-    latencies: Sequence[float],
-    run: RunSettings,
-    plant: KinematicConfig,
-    robot: str,
+    config: AnyConfig, name: str, latencies: Sequence[float], run: RunSettings, plant: KinematicConfig, robot: str
 ) -> float:
     """Return the latency of the camera [s] from which on a loop is predicted to be unstable; inf if none is.
 

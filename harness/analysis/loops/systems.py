@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 
 from servobench.plant.contract.checks import FloatArray
@@ -100,19 +101,12 @@ class ArmModel:
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
         joint, (m, n) = self._joint(), self.jacobian.shape
-        late, _ = split(self.latency, self.period)
-        size, every = len(joint.A), np.eye(n)
-        A, B = np.kron(joint.A, every), np.kron(joint.B, every)
-        exposed, positions = np.kron(joint.C[:1], self.jacobian), np.kron(joint.C[1:], every)
-        line = np.eye(late * m, k=-m)  # frames under way, the newest first
-        entry = np.zeros((late * m, size * n))
-        entry[:m] = exposed[: late * m]
-        A = np.block([[A, np.zeros((size * n, late * m))], [entry, line]])
-        B = np.vstack([B, np.zeros((late * m, n))])
-        oldest = np.hstack([np.zeros((m, size * n + late * m - m)), np.eye(m)])
-        feature = oldest if late else exposed
-        C = np.vstack([feature, np.hstack([positions, np.zeros((n, late * m))])])
-        return StateSpace(np.asarray(A, np.float64), np.asarray(B, np.float64), C, np.zeros((m + n, n)))
+        waiting = split(self.latency, self.period)[0] * m  # numbers of the frames under way
+        joints, B, positions = (np.kron(each, np.eye(n)) for each in (joint.A, joint.B, joint.C[1:]))
+        frames = block_diag(np.kron(joint.C[:1], self.jacobian), np.eye(waiting))  # exposed now, then under way
+        A = np.vstack([np.pad(joints, ((0, 0), (0, waiting))), frames[:waiting]])
+        C = np.vstack([frames[waiting:], np.pad(positions, ((0, 0), (0, waiting)))])
+        return StateSpace(A, np.pad(B, ((0, waiting), (0, 0))), C, np.zeros((m + n, n)))
 
     def response(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Return how a joint answers its command at z, (k,): its position at the exposure and now, (k,) each."""

@@ -238,10 +238,8 @@ class Ledger:
         self._fingerprint = dict(fingerprint)
         self._costs: dict[str, list[float]] = {}
         self._size = 0  # [bytes] of its whole lines: a process that is killed or interrupted may leave half a line
-        if path.is_file():
-            self._read()
-
-    def _read(self) -> None:
+        if not path.is_file():
+            return
         wrong = OSError, KeyError, TypeError, OverflowError, RecursionError
         with configuration_errors(f"study {self.path} cannot be opened: ", *wrong):
             content = self.path.read_bytes()
