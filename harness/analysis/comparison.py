@@ -10,6 +10,7 @@ differences 90 %.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -399,12 +400,9 @@ def margin(name: str, runs: pd.DataFrame) -> float:
 
 def knows_truth(name: str) -> bool:
     """Return whether a controller of this package needs the true robot; a third party's is not loaded for this."""
-    if name not in CONTROLLERS and "+" not in name:
-        return False
-    try:
-        return find_controller(name).needs_truth
-    except ConfigurationError:
-        return False
+    with contextlib.suppress(ConfigurationError):
+        return (name in CONTROLLERS or "+" in name) and find_controller(name).needs_truth
+    return False
 
 
 def compare_pairs(

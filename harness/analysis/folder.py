@@ -97,7 +97,6 @@ NUMBER: Final = re.compile(r"[-+\d∞–]")
 MINUS: Final = re.compile(r"(?<![\w.])-(?=\d)")
 ONE_COLUMN: Final = 50  # letters of all columns of a table that fits one column of a paper, at most
 HEADING: Final = 12  # letters of a line of a heading
-MAIN_PACKAGES: Final = ("numpy", "scipy")
 BIBTEX: Final = r"""\begin{filecontents*}[overwrite]{servobench.bib}
 @misc{servobench,
   author = {{The servobench maintainers}},
@@ -153,7 +152,7 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)
     commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
-    used = [f"{name} {packages[name]}" for name in MAIN_PACKAGES if packages.get(name)]
+    used = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
     used += [str(engine) for engine in (manifest.get("engines") or {}).values()]
     robots = ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
     seeds, count = facts["seeds"].partition(" (")[0], runs["seed"].nunique()

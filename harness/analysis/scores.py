@@ -170,5 +170,4 @@ def _told_apart(means: pd.Series[float], drawn: pd.DataFrame) -> set[frozenset[s
         certain = 0.0 if difference > 0.0 else 1.0
         with np.errstate(under="ignore"):
             p_values.append(2.0 * float(stats.norm.sf(difference / deviation)) if deviation > 0.0 else certain)
-    corrected = holm(p_values)
-    return {frozenset(pair) for pair, p_value in zip(pairs, corrected, strict=True) if p_value < ALPHA}
+    return {frozenset(pair) for pair, p_value in zip(pairs, holm(p_values), strict=True) if p_value < ALPHA}

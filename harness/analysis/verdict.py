@@ -35,8 +35,6 @@ from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
-NO_RIVAL: Final = "none"
-RIVALS: Final = "not shown to be behind the first"  # heading of a column
 NAMED, MANY = 3, 6  # controllers that a sentence names at most
 MOST_PLACES: Final = 24  # for which leaders are named
 
@@ -263,7 +261,7 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
         ("First", "median"): median(first),
         ("Next", "controller"): second,
         ("Next", "median"): median(second),
-        ("How sure", RIVALS): _listed(rivals, NAMED).replace("`", "") if rivals else NO_RIVAL,
+        ("How sure", "not shown to be behind the first"): _listed(rivals).replace("`", "") if rivals else "none",
     }
 
 

@@ -57,7 +57,6 @@ NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> an
     "sensing.noise_offset": ("sensing.noise", ("white", "stable", "uniform")),
     "sensing.outlier_size": ("sensing.outliers", (0.0,)),
 }
-REST: Final = "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
 @dataclass(frozen=True)
@@ -73,11 +72,8 @@ class Campaign:
 def comparison(batch: Batch, settings: Settings) -> Campaign:
     """Return the campaign of a comparison, with steps and, for the first seed, the last image of the camera."""
     first = min(batch.seeds)
-
-    def cell(request: RunRequest) -> Cell:
-        return Cell(request, picture=request.seed == first)
-
-    return Campaign(Grid(cell, batch.requests()), settings, steps=True)
+    cells = Grid(lambda request: Cell(request, picture=request.seed == first), batch.requests())
+    return Campaign(cells, settings, steps=True)
 
 
 class Observer:
@@ -341,7 +337,7 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     for key in dict.fromkeys([*old, *new]):
         if old.get(key) != new.get(key):
             return f"{key} {_short(old.get(key, 'unknown'))} there, {_short(new.get(key, 'unknown'))} here"
-    return REST
+    return "the settings or axes that are varied, or the command"  # of which a manifest has a digest only
 
 
 def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

@@ -20,7 +20,6 @@ AGAIN: Final = "repeat the command that made the folder with --resume"
 REMADE: Final = (
     "servobench report makes the page anew; the rest comes with the runs, from the same command in a new folder"
 )
-LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of failures is made
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
     for name in names:
         with contextlib.suppress(DamagedFile):  # which is made again in any case
             owners.add(tables.owner(folder, name).partition("@")[0])
-    if owners - {manifest["campaign"]} or not owners:
+    if owners != {manifest["campaign"]}:
         raise ConfigurationError(
             f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "
             "restore the file from a copy, or name another folder with --out"
@@ -224,6 +223,6 @@ def _fault(folder: Path, name: str) -> str | None:
 
 def _log(folder: Path) -> str:
     """Return the log of failures as far as it can be made from the table of runs."""
-    groups = tables.row_groups(folder, RUNS, LOGGED)
+    groups = tables.row_groups(folder, RUNS, ("run_id", "status", "reason"))
     rows = (dict(zip(group.columns, row, strict=True)) for group in groups for row in group.to_numpy())
     return "".join(log_entry(row, "") for row in rows)

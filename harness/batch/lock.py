@@ -23,7 +23,6 @@ from servobench.plant.contract.files import PARTIAL, harmless
 
 LOCK = ".lock"
 PARTS: Final = "parts"
-UNREADABLE_OWNER: Final = "a process that did not write its name"
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
             os.close(descriptor)
             if not isinstance(error, BlockingIOError):  # such as ENOLCK of a mount without a lock service
                 raise
-            holder = Holder.read(path) or before or UNREADABLE_OWNER
+            holder = Holder.read(path) or before or "a process that did not write its name"
             raise ConfigurationError(f"results folder {path.parent} is being written by {holder}") from None
         if _same(path, descriptor):
             return descriptor, before

@@ -125,8 +125,7 @@ def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
     Raises:
         ConfigurationError: names the first seed of the tuning range and says which to take instead.
     """
-    found = [seed for seed in seeds if seed in TUNING]
-    if found:
+    if found := [seed for seed in seeds if seed in TUNING]:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise ConfigurationError(
             f"seed {found[0]}{more} cannot be used to judge: {TUNING_WORDS} are kept for tuning; "
@@ -356,8 +355,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
 def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> None:
     """Refuse runs of the same name; only where two of the hashes are equal the names are looked at."""
     values, counts = np.unique(np.frombuffer(hashes, dtype=np.int64), return_counts=True)
-    suspects = set(values[counts > 1].tolist())
-    if suspects:
+    if suspects := set(values[counts > 1].tolist()):
         names = Counter(request.run_id for request in requests if hash(request.run_id) in suspects)
         name, count = names.most_common(1)[0]
         if count > 1:

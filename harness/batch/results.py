@@ -217,8 +217,7 @@ def put_together(folder: Path, manifest: Mapping[str, Any]) -> int:
 
 def vouch(folder: Path, paths: Sequence[Path]) -> None:
     """Write down the checksums of files that accompany the tables, such as figures, where the folder has checksums."""
-    sums = sums_of(folder)
-    if sums is not None:
+    if (sums := sums_of(folder)) is not None:
         digests = {f"{path.relative_to(folder)}": digest(path) for path in paths if path.is_relative_to(folder)}
         with writing(folder):
             append_sums(folder, {name: each for name, each in digests.items() if each not in sums.get(name, ())})

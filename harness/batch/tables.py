@@ -225,8 +225,7 @@ RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of
 
 def lacking(kind: str, schema: pa.Schema) -> str:
     """Return which columns a table of runs or steps lacks, or has of another type, as a predicate; empty if none."""
-    missing = [name for name in NEEDED[kind] if name not in schema.names]
-    if missing:
+    if missing := [name for name in NEEDED[kind] if name not in schema.names]:
         return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}"
     return next(filter(None, (_mistyped(kind, each.name, each.type) for each in schema)), "")
 

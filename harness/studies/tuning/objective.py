@@ -173,9 +173,6 @@ class Trial:
         build_once(self.resolved(runs[:1])[0])
 
 
-Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
-
-
 def run_cost(task: str, row: Mapping[str, Any]) -> float:
     """Return the weighted cost of one run from its row of results; see the module's docstring."""
     weight = WEIGHTS[task]
@@ -190,8 +187,8 @@ def score(costs: Sequence[float]) -> float:
     return float(np.mean(costs))
 
 
-def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[Cost]:
-    """Carry out every run of every trial and yield each cost as it is known, in any order.
+def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[tuple[int, int, float]]:
+    """Carry out every run of every trial; yield indices of trial and run with each cost as it is known, in any order.
 
     Args:
         trials: the trials to score.
@@ -247,8 +244,7 @@ class Ledger:
             header, *records = [json.loads(line) for line in content[: self._size].splitlines()] or [self._fingerprint]
             self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
         known = header if isinstance(header, dict) else {}
-        parts = ", ".join(key for key, value in self._fingerprint.items() if known.get(key) != value)
-        if parts:
+        if parts := ", ".join(key for key, value in self._fingerprint.items() if known.get(key) != value):
             raise ConfigurationError(f"study {self.path} was made with other {parts}; name another folder with --out")
 
     def __len__(self) -> int:
