@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.style import DESIRED, LETTER, WIDE, Layout, Styles, add_legend, divisions, mark_end
-from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
+from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2
@@ -82,7 +82,7 @@ def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[Block]:
     """Return a block for each task and division of methods; the blocks of a task have the same extent."""
     blocks = []
     for task, whole in tasks.items():
-        tracks = each(Track.for_path, whole)
+        tracks = {name: track.for_path() for name, track in whole.items()}
         extent = _Extent(tracks, views)
         for head, names in divisions(tracks).items():
             title = ", ".join(filter(None, (task, head)))

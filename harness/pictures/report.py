@@ -25,7 +25,7 @@ from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import KINDS, page_figures
 from servobench.harness.pictures.style import NARROW, WIDE, Drawing, MethodStyle, drawing_of, method_styles
-from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, load_tables, longest
+from servobench.harness.pictures.tracks import COLUMNS, Shown, Tracks, label_of, load_groups, load_tracks, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
@@ -192,9 +192,7 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
             "controller": str(row["controller"]),
             "place": int(place[number]),
             "reason": str(row.get("reason") or ""),
-            "band": rounded(
-                comparison.handy_unit(row.get("feature_unit"))[1] * float(row.get("settling_band", float("nan")))
-            ),
+            "band": rounded(Shown(row).settling_band),
             "values": [rounded(scales[name] * float(row[name])) for name in known],
         }
         for number, row in zip(shown.index, shown.to_dict("records"), strict=True)
@@ -237,20 +235,13 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
     points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
     curves: dict[str, Json] = {}
-    for first in range(0, len(wanted), STEPS_AT_ONCE) if results.has_steps(folder) else ():
-        part = wanted[first : first + STEPS_AT_ONCE]
-        steps = load_tables(folder, part["run_id"].tolist(), ["run_id", "time_s", "error_norm"])
-        for run_id, feature_unit in zip(part["run_id"], comparison.texts_of(part, "feature_unit"), strict=True):
-            if run_id in steps:
-                curves[run_id] = _curve(steps[run_id], feature_unit, points)
+    for first in range(0, len(wanted), STEPS_AT_ONCE):
+        for track in load_tracks(folder, wanted[first : first + STEPS_AT_ONCE], COLUMNS[:3]):  # the error over time
+            bins = np.array_split(track.error(), min(points, len(track.table)))
+            error = [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins]
+            end, unit = rounded(float(track.time[-1])), track.error_unit[0]
+            curves[track.row["run_id"]] = {"end": end, "unit": unit, "error": error}
     return curves
-
-
-def _curve(steps: pd.DataFrame, feature_unit: str | None, points: int) -> Json:
-    unit, factor = comparison.handy_unit(feature_unit)
-    bins = np.array_split(factor * steps["error_norm"].to_numpy(dtype=np.float64), min(points, len(steps)))
-    error = [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins]
-    return {"end": rounded(float(steps["time_s"].iloc[-1])), "unit": unit, "error": error}
 
 
 def rounded(value: float) -> float | None:
@@ -259,7 +250,7 @@ def rounded(value: float) -> float | None:
 
 
 def _view(title: str, tracks: Tracks) -> Json:
-    few = each(Track.for_path, tracks)
+    few = {name: track.for_path() for name, track in tracks.items()}
     whole = longest(few)
     reference = whole.vectors("reference_")[:, :3]
     still = whole.point_to_point

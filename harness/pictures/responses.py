@@ -44,7 +44,6 @@ from servobench.harness.pictures.tracks import (
     Shown,
     Track,
     Tracks,
-    each,
     label_of,
     longest,
     quantile,
@@ -108,7 +107,7 @@ def draw_features(
     figure = Figure(figsize=(layout.width, 1.1 + 1.3 * len(features)), layout="constrained")
     panels = figure.subplots(len(features), len(tasks), sharex="col", sharey="row", squeeze=False)
     for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
-        tracks = each(Track.overview, whole)
+        tracks = {name: track.overview() for name, track in whole.items()}
         for axes, feature in zip(column, features, strict=True):
             draw_feature(axes, tracks, styles, feature)
         column[0].set_title(task)
@@ -130,7 +129,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
             axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
         return figure
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
-    heads, closing = divisions(ensembles), each(Track.closing, tracks)
+    heads, closing = divisions(ensembles), {name: track.closing() for name, track in tracks.items()}
     figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
     panels = figure.subplots(
         1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
@@ -295,7 +294,7 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
 
     A long run is shown at its end. A wide layout has room for a metric in each panel.
     """
-    shown = each(Track.closing, tracks)
+    shown = {name: track.closing() for name, track in tracks.items()}
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
     if not columns:
         return None

@@ -6,7 +6,7 @@ medians and bands.
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, final
@@ -37,7 +37,7 @@ MIN_SHARE = 0.2  # of a run that a figure shows at least
 class Shown:
     """Unit, band and kind in which runs of a task are shown, by their rows in the table of runs."""
 
-    row: Mapping[str, Any]  # of the run, or of the first one
+    row: Mapping[Any, Any]  # of the run, or of the first one
 
     @property
     def point_to_point(self) -> bool:
@@ -150,34 +150,29 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
-        for track in _load_tracks(folder, chosen):
-            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = track_of(track.row, track.table)
+        for track in load_tracks(folder, chosen):
+            tasks.setdefault(track.row["task"], {})[track.row["controller"]] = track
         if tasks:  # a sweep keeps no steps, and a run may end before its first
             yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
 
 
-def track_of(row: Mapping[str, Any], steps: pd.DataFrame) -> Track:
+def track_of(row: Mapping[Any, Any], steps: pd.DataFrame) -> Track:
     """Return the track of a run whose steps come from a table with columns of other runs."""
     return Track(row, steps.dropna(axis=1, how="all").reset_index(drop=True))
 
 
-def load_tables(folder: Path, run_ids: list[str], columns: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
-    """Return the steps of each of these runs that has some, by its identifier; all columns, or those named."""
+def load_tracks(folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None) -> Iterator[Track]:
+    """Yield the tracks of those runs that have steps, in their order; with all columns, or those named."""
     try:
-        steps = results.load_steps(folder, run_ids, columns)
+        steps = results.load_steps(folder, runs["run_id"].tolist(), columns)
     except ConfigurationError as error:  # none is kept, or each of these runs ended before its first period
         if type(error) is not ConfigurationError:  # a file is damaged
             raise
-        return {}
-    return {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
-
-
-def _load_tracks(folder: Path, runs: pd.DataFrame, columns: Collection[str] | None = None) -> Iterator[Track]:
-    """Yield the tracks of those runs that have steps, in their order."""
-    tables = load_tables(folder, runs["run_id"].tolist(), columns)
+        return
+    tables = {str(run_id): own for run_id, own in steps.groupby("run_id", sort=False)}
     for row in runs.drop_duplicates("run_id").to_dict("records"):
         if row["run_id"] in tables:
-            yield Track({str(key): value for key, value in row.items()}, tables[row["run_id"]])
+            yield track_of(row, tables[row["run_id"]])
 
 
 def values_drawn(row: Mapping[Any, Any]) -> dict[str, Any]:
@@ -188,11 +183,6 @@ def values_drawn(row: Mapping[Any, Any]) -> dict[str, Any]:
     """
     with configuration_errors(f"run {row['run_id']} has mismatch_values that are none: ", TypeError):
         return dict(json.loads(row.get("mismatch_values") or "{}"))
-
-
-def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
-    """Return the tracks as `Track.overview`, `Track.closing` or `Track.for_path` make them."""
-    return {name: kind(track) for name, track in tracks.items()}
 
 
 def longest(tracks: Tracks) -> Track:
@@ -260,7 +250,7 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     share = results.read_manifest(folder).get("configuration", {}).get("run", {}).get("camera_moves_at")
     share = share if isinstance(share, int | float) and 0.0 <= share < 1.0 else math.nan
     tracks: dict[str, dict[str, list[Track]]] = {}
-    for track in _load_tracks(folder, runs, COLUMNS):
+    for track in load_tracks(folder, runs, COLUMNS):
         tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
     return {task: {name: _ensemble(own, share) for name, own in named.items()} for task, named in tracks.items()}
 
