@@ -4,19 +4,13 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const NS = "http://www.w3.org/2000/svg";
 const FIRST_ROWS = 25;
 
-function element(name, text, attributes = {}) {
-  const made = document.createElement(name);
+function filled(made, text, attributes) {
   made.textContent = text;
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   return made;
 }
-
-function drawn(name, attributes, text = "") {
-  const made = document.createElementNS(NS, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.textContent = text;
-  return made;
-}
+const element = (name, text, attributes = {}) => filled(document.createElement(name), text, attributes);
+const drawn = (name, attributes, text = "") => filled(document.createElementNS(NS, name), text, attributes);
 
 // Contents: always open beside the page, folded above it.
 const contents = document.querySelector("nav details");

@@ -8,13 +8,10 @@
   const choice = document.getElementById("space-choice");
   const names = document.getElementById("space-names");
   const hidden = new Set();
-  const HOME = { turn: 0.35, tilt: 0.3, zoom: 1 };
-  let eye = { ...HOME }, view = views[0], box = null;
-
-  const all = () => [...view.reference, ...view.start, ...Object.values(view.paths).flat()];
+  let eye = { turn: 0.35, tilt: 0.3, zoom: 1 }, view = views[0], box = null;
 
   function measure() {
-    const points = all();
+    const points = [...view.reference, ...view.start, ...Object.values(view.paths).flat()];
     const low = [0, 1, 2].map((i) => Math.min(...points.map((p) => p[i])));
     const high = [0, 1, 2].map((i) => Math.max(...points.map((p) => p[i])));
     const widest = Math.max(...high.map((h, i) => h - low[i]), 1e-9);
@@ -109,13 +106,11 @@
 
   function mark(point, text, filled) {
     const [x, y] = project(point);
-    pen.beginPath();
-    pen.rect(x - 5, y - 5, 10, 10);
     pen.fillStyle = filled ? "#000" : "#fff";
-    pen.fill();
+    pen.fillRect(x - 5, y - 5, 10, 10);
     pen.strokeStyle = "#000";
     pen.lineWidth = 1.6;
-    pen.stroke();
+    pen.strokeRect(x - 5, y - 5, 10, 10);
     pen.fillStyle = "#000";
     pen.textAlign = "left";
     pen.fillText(text, x + 9, y - 8);
@@ -162,20 +157,20 @@
   document.getElementById("space-nearer").addEventListener("click", zoom(1.25));
   document.getElementById("space-further").addEventListener("click", zoom(0.8));
   document.getElementById("space-reset").addEventListener("click", () => { eye = { turn: 0, tilt: 0, zoom: 1 }; paint(); });
-  canvas.addEventListener("pointermove", (event) => {
-    if (!(event.buttons & 1)) return;
-    eye.turn += event.movementX * 0.008;
-    eye.tilt = Math.min(1.57, Math.max(-1.57, eye.tilt + event.movementY * 0.008));
+  function turn(across, down) {
+    eye.turn += across;
+    eye.tilt = Math.min(1.57, Math.max(-1.57, eye.tilt + down));
     paint();
+  }
+  canvas.addEventListener("pointermove", (event) => {
+    if (event.buttons & 1) turn(event.movementX * 0.008, event.movementY * 0.008);
   });
   canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
   canvas.addEventListener("keydown", (event) => {
-    const turn = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[event.key];
-    if (!turn) return;
+    const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[event.key];
+    if (!step) return;
     event.preventDefault();
-    eye.turn += turn[0];
-    eye.tilt = Math.min(1.57, Math.max(-1.57, eye.tilt + turn[1]));
-    paint();
+    turn(...step);
   });
   window.addEventListener("resize", paint);
   show(0);
