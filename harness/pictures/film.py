@@ -24,7 +24,7 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.installation import missing_extra
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
-from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
+from servobench.harness.pictures.style import figure_style, method_styles, plain_logarithms, save_figure
 from servobench.harness.run.request import DEFAULT_ROBOT, short_name
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -163,9 +163,8 @@ def _failure(path: Path, process: subprocess.Popen[bytes], complaints: IO[bytes]
     """Return the error of a failed call of ffmpeg, with the last line of its output."""
     code = process.wait()
     complaints.seek(0)
-    lines = complaints.read().decode(errors="replace").split("\n")
-    said = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with exit code {code}")
-    return ConfigurationError(f"ffmpeg cannot write {path}: {said}")
+    last = complaints.read().decode(errors="replace").rstrip().rpartition("\n")[2].strip()
+    return ConfigurationError(f"ffmpeg cannot write {path}: {last or f'it ended with exit code {code}'}")
 
 
 def draw_snapshots(run: LoggedRun) -> Figure:
@@ -193,23 +192,20 @@ class _Board:
     """A frame around the two pictures: its background is drawn once, the error's line and the numbers in each frame."""
 
     def __init__(self, run: LoggedRun) -> None:
-        self._run = run
-        self._style, self._error = _style(run), run.track.error()
+        self._run, self._colour, self._error = run, _colour(run), run.track.error()
         with figure_style():
-            figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
-            self._figure = figure
+            self._figure = figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
             self._canvas = cast("Any", FigureCanvasAgg(figure))
             title = figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=TYPE, fontweight="bold")
             title.set_fontsize(TYPE * min(1.0, 0.98 * WIDTH / title.get_window_extent().width))
             self._axes = figure.add_axes((0.11, 0.1, 0.865, 0.225))
             self._prepare_axes()
             left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
-            figure.text(left, top, "the camera's view", fontsize=TYPE, va="top")
-            self._numbers = figure.text(
-                left, top - 0.06, "", fontsize=TYPE, va="top", family="monospace", animated=True
-            )
+            below: dict[str, Any] = {"fontsize": TYPE, "va": "top"}
+            figure.text(left, top, "the camera's view", **below)
+            self._numbers = figure.text(left, top - 0.06, "", family="monospace", animated=True, **below)
             lines = [
-                mpl.lines.Line2D([], [], color=self._style.colour, linewidth=3, label="ball, so far"),
+                mpl.lines.Line2D([], [], color=self._colour, linewidth=3, label="ball, so far"),
                 mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label=_desired(run)),
             ]
             figure.legend(
@@ -228,9 +224,8 @@ class _Board:
         self._line.set_data(time[: k + 1], self._error[: k + 1])
         self._now.set_data(time[k : k + 1], self._error[k : k + 1])
         self._numbers.set_text(f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {run.track.error_unit[0]}")
-        for artist in (self._line, self._now):
-            self._axes.draw_artist(artist)
-        self._figure.draw_artist(self._numbers)
+        for artist in (self._line, self._now, self._numbers):
+            self._figure.draw_artist(artist)
         frame: ByteArray = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         view = cv2.resize(replay.overview(_trails(run, k)), (VIEW_WIDTH, VIEW_HEIGHT), interpolation=cv2.INTER_AREA)
         frame[HEAD : HEAD + VIEW_HEIGHT, :VIEW_WIDTH] = view
@@ -254,18 +249,18 @@ class _Board:
         axes.tick_params(labelsize=TYPE - 2)
         axes.set_xlabel("time [s]", fontsize=TYPE)
         axes.set_ylabel(f"error [{track.error_unit[0]}]", fontsize=TYPE)
-        (self._line,) = axes.plot([], [], color=self._style.colour, linewidth=1.8, animated=True)
-        (self._now,) = axes.plot([], [], color=self._style.colour, marker="o", markersize=6, animated=True)
+        (self._line,) = axes.plot([], [], color=self._colour, linewidth=1.8, animated=True)
+        (self._now,) = axes.plot([], [], color=self._colour, marker="o", markersize=6, animated=True)
 
 
-def _style(run: LoggedRun) -> MethodStyle:
+def _colour(run: LoggedRun) -> str:
     name = run.track.row["controller"]
-    return method_styles([name])[name]
+    return method_styles([name])[name].colour
 
 
 def _trails(run: LoggedRun, k: int) -> list[Trail]:
     """Return the desired path, or a cross at a fixed target, and the ball's path up to period `k`."""
-    red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_style(run).colour))
+    red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_colour(run)))
     desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
     cross = [desired[0] + np.stack([-arm, arm]) for arm in CROSS * np.eye(3)]
     lines = cross if run.track.point_to_point else [desired]
@@ -294,12 +289,9 @@ def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
         place = point if counts else place
     if way[-1] == 0.0:  # the arm rests throughout
         return [round(k) for k in np.linspace(0, len(ball) - 1, count)]
-    chosen = [int(k) for k in np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12))]
-    for i in range(1, count):  # apart, where one period takes the ball far
-        chosen[i] = max(chosen[i], chosen[i - 1] + 1)
-    for i in reversed(range(count)):
-        chosen[i] = min(chosen[i], len(ball) - count + i)
-    return chosen
+    chosen, order = np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12)), np.arange(count)
+    apart = np.maximum.accumulate(chosen - order) + order  # where one period takes the ball far
+    return [int(k) for k in np.minimum(apart, len(ball) - count + order)]
 
 
 def _lap(run: LoggedRun) -> int:

@@ -72,12 +72,11 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
     figure = Figure(figsize=(3.6 * columns + 0.8, 2.9 * rows + 0.4), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     norm = mpl.colors.BoundaryNorm(PEAKS, 256)
-    drawn = None
     for axes, loop in zip(grid.flat, loops, strict=False):
         peaks = np.minimum(loop.sensitivity_peaks(FACTORS, LATENCIES.tolist()), 2.0 * PEAKS[-1])
         limits = loop.gain_limits(LATENCIES.tolist())
         unstable = FACTORS[:, None] >= limits[None, :]
-        drawn = axes.pcolormesh(
+        axes.pcolormesh(
             1000.0 * LATENCIES, FACTORS, np.where(unstable, np.nan, peaks), norm=norm, cmap="viridis_r",
             shading="nearest", rasterized=True,
         )  # fmt: skip
@@ -93,8 +92,7 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
         axes.set_xlabel("latency of the camera [ms]")
     for axes in grid[:, 0]:
         axes.set_ylabel("factor on the command")
-    if drawn is not None:
-        figure.colorbar(drawn, ax=grid, label="M_s", format="%g")
+    figure.colorbar(mpl.cm.ScalarMappable(norm, "viridis_r"), ax=grid, label="M_s", format="%g")
     return figure
 
 
@@ -127,8 +125,7 @@ def _falling_phase(curve: FloatArray) -> FloatArray:
 
 def _finish_frequencies(magnitude: Axes, phase: Axes, peaks: Axes) -> None:
     for axes in (magnitude, phase, peaks):
-        axes.set_xscale("log")
-        axes.set_xlabel("frequency [rad/s]")
+        axes.set(xscale="log", xlabel="frequency [rad/s]")
     magnitude.set(title="Open loop L", ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
     magnitude.axhline(1.0, color="0.4", linewidth=0.9)
     plain_logarithms(magnitude)

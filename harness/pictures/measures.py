@@ -277,8 +277,7 @@ def draw_curves(
     Methods with the same curve share one line, and the panel names them. An infinite estimate is a mark at the upper
     edge `top`.
     """
-    x, shared = np.array(places, dtype=float), []
-    groups = same_curves(values)
+    x, groups = np.array(places, dtype=float), same_curves(values)
     for names in groups:
         first, style = names[0], styles[names[0]]
         y, low, high = (np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high"))
@@ -291,14 +290,13 @@ def draw_curves(
         for name in names[1:]:
             axes.plot([], [], label=name, **styles[name].line_arguments(1))
         if len(names) > 1:
-            shared.append(("all methods" if len(groups) == 1 else ", ".join(names), y))
-    for names_text, y in shared:
-        constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
-        words = textwrap.fill(f"one line{constant}: {names_text}", LINE_LETTERS)
-        upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
-        level, side = (0.96, "top") if upper else (0.04, "bottom")
-        axes.text(0.03, level, words, transform=axes.transAxes, va=side, fontsize=TEXT - 2.0,
-                  bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0})  # fmt: skip
+            shared = "all methods" if len(groups) == 1 else ", ".join(names)
+            constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
+            words = textwrap.fill(f"one line{constant}: {shared}", LINE_LETTERS)
+            upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
+            level, side = (0.96, "top") if upper else (0.04, "bottom")
+            axes.text(0.03, level, words, transform=axes.transAxes, va=side, fontsize=TEXT - 2.0,
+                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0})  # fmt: skip
     axes.set_ylim(-0.02 * top, top)
 
 

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from servobench.controllers.methods import METHODS, PUBLISHED
+from servobench.controllers.methods import PUBLISHED
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
@@ -156,11 +156,7 @@ _STYLES = {
     "rls": MethodStyle(SKY, "-", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
 }
-_STYLES |= {
-    name + PUBLISHED: replace(style, line=DASHED, hollow=True)
-    for name, style in _STYLES.items()
-    if name + PUBLISHED in METHODS
-}
+_STYLES |= {name + PUBLISHED: replace(style, line=DASHED, hollow=True) for name, style in _STYLES.items()}
 
 
 def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
