@@ -46,8 +46,6 @@ CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: larger than
 CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
 GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
 QUALITY = "22"  # of H.264: smaller is better and larger
-Write = Callable[[ByteArray], None]
-"""Appends a frame (height, width, 3) to a film."""
 
 
 def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:
@@ -106,8 +104,8 @@ def find_ffmpeg() -> str:
 
 
 @contextmanager
-def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
-    """Yield a function that appends a frame to the film `path`; the film is complete when the context ends.
+def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Iterator[Callable[[ByteArray], None]]:
+    """Yield a function that appends a frame (height, width, 3) to the film `path`, complete when the context ends.
 
     Args:
         ffmpeg: the program.

@@ -83,7 +83,7 @@ def _draw_each_task(runs: pd.DataFrame, rows: list[str], styles: Styles, layout:
     tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
     height = 0.55 + LINE * max(LEAST_ROWS, len(names))
     figure = Figure(figsize=(layout.width, 0.65 + len(rows) * height), layout="constrained")
-    parts = np.atleast_1d(np.array(figure.subfigures(len(rows), 1), dtype=object))
+    parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, row in zip(parts, rows, strict=True):
         panels = part.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
         for axes, task in zip(panels, tasks, strict=True):
@@ -142,16 +142,15 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
         if layout.wide:
             axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
                           fontweight="bold" if "\n" in words else None, linespacing=1.0)  # fmt: skip
+    above: dict[str, Any] = {"va": "bottom", "fontsize": TEXT - 0.5, "xytext": (0, 2), "textcoords": "offset points"}
     if layout.wide:
-        axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom",
-                      fontsize=TEXT - 0.5, xytext=(0, 2), textcoords="offset points")  # fmt: skip
+        axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", **above)
     if math.isfinite(limit):
         top = max(top, 1.6 * limit)
         axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
         axes.axvspan(limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0)
-        axes.annotate(f"control period, {limit:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
-                      ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
-                      textcoords="offset points")  # fmt: skip
+        words = f"control period, {limit:g} ms"
+        axes.annotate(words, (limit, 1.0), xycoords=("data", "axes fraction"), ha="right", **above)
     plain_logarithms(axes, "x")
     axes.set_xlabel("step of the controller [ms]" if layout.wide else "step [ms]")
     axes.set_xlim(right=top)
@@ -225,13 +224,7 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
 
 
 def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
-    """Set the range in which `values` are shown, linear or logarithmic, and return its upper end.
-
-    Args:
-        axes: where.
-        values: at least 0, NaN where there is none.
-        room: upper end over the largest value on a linear axis.
-    """
+    """Show values of at least 0, linear with `room` over the largest one or logarithmic; return the upper end."""
     largest, least = float(values.max()), float(values.min())
     if least > 0.0 and largest / least > WIDE_RANGE:
         edge = largest * float((largest / least) ** 0.08)
@@ -356,5 +349,4 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     for (axis, unit), group in along.groupby(["axis", "unit"], sort=False):
         name = str(axis).replace("_", " ")
         sweeps[f"{name} [{unit}]" if unit else name] = pd.concat([none, group]) if len(none) else group
-    known = {label: part.dropna(subset=["size"]) for label, part in sweeps.items()}
-    return {label: part for label, part in known.items() if part["size"].nunique() > 1}
+    return {label: part.dropna(subset=["size"]) for label, part in sweeps.items() if part["size"].nunique() > 1}

@@ -35,14 +35,6 @@ class View(NamedTuple):
     upright: int
 
 
-class Block(NamedTuple):
-    """The views of the runs of a task that stand above each other."""
-
-    title: str
-    tracks: Tracks
-    extent: _Extent
-
-
 def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw the true paths of one run of each controller in two views, to scale; None with fewer than two features.
 
@@ -55,38 +47,38 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     columns = min(COLUMNS, layout.columns, len(blocks))
     rows = -(-len(blocks) // columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
-    ratios = [max(block.extent.ratio(view) for block in line) for line in lines for view in views]
+    ratios = [max(extent.ratio(view) for _, _, extent in line) for line in lines for view in views]
     width = SINGLE if layout.wide and columns == 1 else layout.width / columns - BESIDE
-    lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout.wide else 1.0)
+    lines_below = LINE * sum(len(tracks) for _, tracks, _ in blocks) * (0.1 if layout.wide else 1.0)
     height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
     figure = Figure(figsize=(layout.width, height), layout="compressed")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
-    for number, block in enumerate(blocks):
+    for number, (heading, tracks, extent) in enumerate(blocks):
         row, column = divmod(number, columns)
         for i, view in enumerate(views, row * len(views)):
             axes = grid[i, column]
-            _draw_view(axes, block.tracks, styles, view)
-            block.extent.apply(axes, view, ratios[i])
-            title = f"{block.title}: {view.title}" if len(views) > 1 else block.title
+            _draw_view(axes, tracks, styles, view)
+            extent.apply(axes, view, ratios[i])
+            title = f"{heading}: {view.title}" if len(views) > 1 else heading
             axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
             if view is not views[-1] and views[views.index(view) + 1].across == view.across:  # one abscissa for both
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)
-    for axes in grid.reshape(rows, len(views), columns).transpose(0, 2, 1).reshape(-1, len(views))[len(blocks) :].flat:
-        axes.set_visible(False)
-    add_legend(figure, [axes for axes in grid.flat if axes.get_visible()])
+    for axes in grid.flat:
+        axes.set_visible(axes.has_data())
+    add_legend(figure, grid.flat)
     return figure
 
 
-def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[Block]:
-    """Return a block for each task and division of methods; the blocks of a task have the same extent."""
+def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[tuple[str, Tracks, _Extent]]:
+    """Return title, tracks and extent of each task and division of methods; a task has the same extent in all."""
     blocks = []
     for task, whole in tasks.items():
         tracks = {name: track.for_path() for name, track in whole.items()}
         extent = _Extent(tracks, views)
         for head, names in divisions(tracks).items():
             title = ", ".join(filter(None, (task, head)))
-            blocks.append(Block(title, {name: tracks[name] for name in names}, extent))
+            blocks.append((title, {name: tracks[name] for name in names}, extent))
     return blocks
 
 

@@ -86,8 +86,8 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
     def in_base(points: FloatArray) -> FloatArray:
-        later = points[:0] if moved is None else moved.to_base(points[moved_from:])
-        return np.concatenate([model.to_base(points[:moved_from]), later])
+        before, after = points[:moved_from], points[moved_from:]
+        return np.concatenate([model.to_base(before), (moved or model).to_base(after)])
 
     reference = track.vectors("reference_")
     return LoggedRun(track, robot, model, moved, moved_from, q, in_base(ball), in_base(reference))
@@ -165,8 +165,7 @@ class Replay(AbstractContextManager["Replay"]):
         pixels, far = self._overview.pixels(trail.points)
         if (far < camera.near).any():
             return
-        columns = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
-        rows = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+        columns, rows = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         hidden = far > depth[rows, columns] + SEEN_DEPTH
         corners = np.round(pixels * 16).astype(np.int32)
         width = max(1, round(trail.width * self._fineness))

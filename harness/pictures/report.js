@@ -115,19 +115,19 @@ function curveOf(number, width) {
   const low = Math.min(...values), high = Math.max(...values, low * 10), end = Math.max(own.end, ...others.map((k) => data.curves[k].end));
   const x = (t) => left + (width - left - right) * (t / (end || 1));
   const y = (v) => top + (height - top - bottom) * (1 - Math.log(v / low) / Math.log(high / low));
+  const line = (name, d, more = {}) => svg.append(drawn("path", { class: name, d, ...more }));
+  const label = (text, at, level, anchor, more = {}) => svg.append(drawn("text", { class: "tick", x: at, y: level, "text-anchor": anchor, ...more }, text));
   for (const tick of ticksOf(low, high)) {
-    svg.append(drawn("path", { class: "grid", d: `M${left} ${y(tick)}H${width - right}` }));
-    svg.append(drawn("text", { class: "tick", x: left - 6, y: y(tick) + 4, "text-anchor": "end" }, String(Number(tick.toPrecision(1)))));
+    line("grid", `M${left} ${y(tick)}H${width - right}`);
+    label(String(Number(tick.toPrecision(1))), left - 6, y(tick) + 4, "end");
   }
-  for (let i = 0; i <= 4; i += 1) {
+  ["start", "middle", "middle", "middle", "end"].forEach((anchor, i) => {
     const t = (end * i) / 4;
-    svg.append(drawn("text", { class: "tick", x: x(t), y: height - 20, "text-anchor": ["start", "middle", "middle", "middle", "end"][i] },
-      String(Number(t.toPrecision(3)))));
-  }
-  svg.append(drawn("path", { class: "axis", d: `M${left} ${top}V${height - bottom}H${width - right}` }));
-  svg.append(drawn("text", { class: "tick", x: (left + width) / 2, y: height - 4, "text-anchor": "middle" }, "time [s]"));
-  svg.append(drawn("text", { class: "tick", x: 12, y: height / 2, transform: `rotate(-90 12 ${height / 2})`, "text-anchor": "middle" },
-    `true error [${own.unit}]`));
+    label(String(Number(t.toPrecision(3))), x(t), height - 20, anchor);
+  });
+  line("axis", `M${left} ${top}V${height - bottom}H${width - right}`);
+  label("time [s]", (left + width) / 2, height - 4, "middle");
+  label(`true error [${own.unit}]`, 12, height / 2, "middle", { transform: `rotate(-90 12 ${height / 2})` });
   const path = (curve) => {
     let d = "", pen = "M";
     curve.error.forEach((v, i) => {
@@ -137,10 +137,10 @@ function curveOf(number, width) {
     });
     return d;
   };
-  for (const key of others) svg.append(drawn("path", { class: "others", d: path(data.curves[key]) }));
+  for (const key of others) line("others", path(data.curves[key]));
   const band = data.runs[number].band;
-  if (band >= low && band <= high) svg.append(drawn("path", { class: "band", d: `M${left} ${y(band)}H${width - right}` }));
-  svg.append(drawn("path", { class: "own", stroke: (data.swatches[data.runs[number].controller] ?? {}).colour ?? "#000", d: path(own) }));
+  if (band >= low && band <= high) line("band", `M${left} ${y(band)}H${width - right}`);
+  line("own", path(own), { stroke: (data.swatches[data.runs[number].controller] ?? {}).colour ?? "#000" });
   return svg;
 }
 
@@ -156,13 +156,10 @@ function openRun(number) {
   cell.colSpan = row.cells.length;
   cell.append(element("h4", run.id));
   if (run.reason) cell.append(element("p", run.reason));
-  if (data.curves[number]) {
-    const width = Math.max(280, cell.clientWidth - 12);
-    cell.append(curveOf(number, width));
-    cell.append(element("p", "Coloured: this run. Grey: the other seeds of this controller in the same place. Dashed: settling band.", { class: "key" }));
-  } else {
-    cell.append(element("p", "The steps of this run are not in the page.", { class: "key" }));
-  }
+  const known = data.curves[number];
+  const drawing = "Coloured: this run. Grey: the other seeds of this controller in the same place. Dashed: settling band.";
+  if (known) cell.append(curveOf(number, Math.max(280, cell.clientWidth - 12)));
+  cell.append(element("p", known ? drawing : "The steps of this run are not in the page.", { class: "key" }));
   const list = element("dl", "");
   data.measures.forEach((name, i) => {
     if (run.values[i] !== null) list.append(element("dt", name), element("dd", String(run.values[i])));
@@ -174,8 +171,7 @@ function follow() {
   const match = /^#run-(\d+)$/.exec(location.hash);
   if (!match) return;
   openRun(match[1]);
-  const row = document.getElementById(`run-${match[1]}`);
-  if (row) row.scrollIntoView({ block: "start" });
+  document.getElementById(`run-${match[1]}`)?.scrollIntoView({ block: "start" });
 }
 window.addEventListener("hashchange", follow);
 runTable.addEventListener("click", (event) => {

@@ -274,7 +274,7 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
     few = [track.thinned(len(longest.table) // OVERVIEW if longest.long else 1) for track in tracks]
     time = max((track.time for track in few), key=len)
 
-    def padded(track: Track, values: FloatArray, filling: float) -> FloatArray:
+    def padded(values: FloatArray, filling: float) -> FloatArray:
         return np.concatenate([values, np.full(len(time) - len(values), filling)])
 
     times = np.concatenate([track.column(STEP_TIME) for track in tracks])
@@ -282,8 +282,8 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
         tracks[0].row,
         runs,
         time,
-        np.stack([padded(track, track.error(), math.nan if track.completed else math.inf) for track in few]),
-        np.stack([padded(track, 100.0 * track.column(JACOBIAN), math.nan) for track in few]),
+        np.stack([padded(track.error(), math.nan if track.completed else math.inf) for track in few]),
+        np.stack([padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]),
         times[times > 0.0],
         moved_at,
     )
