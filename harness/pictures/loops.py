@@ -41,11 +41,9 @@ def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
     for loop in loops:
         style, response = styles[loop.name], loop.response
         L, frequency = response.at_feature(), response.frequency
-        curves = loci(L)
         look = style.line_arguments(len(frequency))
-        for i, curve in enumerate(curves.T):
-            name = {"label": loop.name} if i == 0 else {}
-            magnitude.plot(frequency, np.abs(curve), **look, **name)
+        for i, curve in enumerate(loci(L).T):
+            magnitude.plot(frequency, np.abs(curve), label=None if i else loop.name, **look)
             phase.plot(frequency, _falling_phase(curve), **look)
             nyquist.plot(curve.real, curve.imag, **(look | {"marker": ""}))
         peaks.plot(frequency, largest_gain(sensitivity(L)), **look)
@@ -57,8 +55,7 @@ def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
     _finish_nyquist(nyquist)
     step.set(title="Step of the reference", xlabel="time [s]", ylabel="feature", ylim=(-0.05, 1.6))
     limits.axhline(1.0, color="0.4", linewidth=0.9)
-    latency = 1000.0 * loops[0].arm.latency
-    limits.axvline(latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
+    limits.axvline(1000.0 * loops[0].arm.latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
     limits.set(title="Gain margin", xlabel="latency of the camera [ms]", ylabel="factor on command", ylim=(0.3, 20.0))
     plain_logarithms(limits)
     add_legend(figure, [magnitude])

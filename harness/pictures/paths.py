@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -141,11 +141,10 @@ def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
             if not track.completed:
                 mark_end(axes, points[:, 0], points[:, 1], styles[name])
     start = _points(whole, "true_feature_")[:1, chosen]
-    axes.plot(*start.T, color="black", marker="s", markersize=6, markerfacecolor="white", markeredgewidth=1.3,
-              linestyle="", label="start", zorder=10)  # fmt: skip
+    hollow: dict[str, Any] = {"color": "black", "markerfacecolor": "white", "linestyle": ""}
+    axes.plot(*start.T, marker="s", markersize=6, markeredgewidth=1.3, label="start", zorder=10, **hollow)
     if whole.point_to_point:
-        axes.plot(*reference[:1].T, color="black", marker="*", markersize=10, markerfacecolor="white", linestyle="",
-                  label="target", zorder=11)  # fmt: skip
+        axes.plot(*reference[:1].T, marker="*", markersize=10, label="target", zorder=11, **hollow)
     labels = [CAMERA_FRAME.get(whole.features[i], label_of(whole.features[i])) for i in chosen]
     axes.set(xlabel=labels[0], ylabel=labels[1])
 

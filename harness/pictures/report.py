@@ -8,7 +8,7 @@ numbers that `space.js` and `report.js` draw. `notebooks/analysis.ipynb` shows t
 import base64
 import hashlib
 import re
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -36,6 +36,7 @@ from servobench.plant.contract.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
+OWN: Final = Path(__file__).parent  # of template, style and scripts
 PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
 LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
@@ -107,11 +108,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     numbered, facts = tables.runs_table(shown), describe_folder(folder, runs)
     numbered.insert(0, (tables.WHICH, "run"), shown.index.to_list())
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=FileSystemLoader(OWN), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"breakable": breakable, "cell": cell, "marked": marked, "sheet": sheet}
     return environment.get_template(TEMPLATE).render(
@@ -141,7 +138,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
 
 
 def _asset(name: str) -> str:
-    return (Path(__file__).parent / name).read_text(encoding="utf-8")
+    return (OWN / name).read_text(encoding="utf-8")
 
 
 def _policy(style: str, scripts: list[str]) -> str:
@@ -182,10 +179,8 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     shown = comparison.in_handy_units(shown)
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
     scales = {name: comparison.shown_unit(name, shown)[1] for name in known}
-    place = shown.groupby(
-        ["controller", *(n for n in ("task", *tables.CONDITIONS, *varied_columns(shown.columns)) if n in shown)],
-        dropna=False,
-    ).ngroup()
+    keys = ("controller", "task", *tables.CONDITIONS, *varied_columns(shown.columns))
+    place = shown.groupby([name for name in keys if name in shown], dropna=False).ngroup()
     runs = {
         str(number): {
             "id": str(row["run_id"]),
@@ -222,7 +217,7 @@ def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
         for task, tracks in group.tasks.items()
         if all(len(track.features) >= 3 for track in tracks.values())
     )
-    return [view for view, _ in zip(views, range(MOST_VIEWS), strict=False)]
+    return list(islice(views, MOST_VIEWS))
 
 
 def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
@@ -253,11 +248,10 @@ def _view(title: str, tracks: Tracks) -> Json:
     few = {name: track.for_path() for name, track in tracks.items()}
     whole = longest(few)
     reference = whole.vectors("reference_")[:, :3]
-    still = whole.point_to_point
     return {
         "title": title,
         "axes": [label_of(name).replace("z [", "depth z [") for name in whole.features[:3]],
-        "reference": _points(reference[:1] if still else reference),
+        "reference": _points(reference[:1] if whole.point_to_point else reference),
         "start": _points(whole.vectors("true_feature_")[:1, :3]),
         "paths": {name: _points(track.vectors("true_feature_")[:, :3]) for name, track in few.items()},
     }

@@ -124,10 +124,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
     Of a long run, the latter is drawn at its end only, on a narrow sheet not at all.
     """
     if layout.columns < COLUMNS:
-        figure, drawn = _draw_tasks({"": ensembles}, styles, draw_error, layout)
-        for axes, _ in drawn:
-            axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
-        return figure
+        return _draw_tasks({"": ensembles}, styles, draw_error, layout)[0]
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
     heads, closing = divisions(ensembles), {name: track.closing() for name, track in tracks.items()}
     figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
@@ -137,7 +134,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: 
     )  # fmt: skip
     for column, (head, names) in zip(panels.T, heads.items(), strict=True):
         draw_error(column[0], {name: ensembles[name] for name in names}, styles)
-        column[0].set(title=head, ylabel=f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
+        column[0].set_title(head)
         shown = {name: closing[name] for name in names if name in closing}
         for axes, feature in zip(column[1:], features, strict=True) if shown else ():
             _draw_feature_error(axes, shown, styles, feature)
@@ -184,7 +181,8 @@ def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) ->
         _mark_settling_times(axes, ensembles, styles)
     if math.isfinite(first.camera_moved_at):
         axes.axvline(first.camera_moved_at, color="0.4", linewidth=0.9, linestyle="-.", label=CAMERA_MOVES)
-    axes.set_ylabel(f"true error [{first.error_unit[0]}]")
+    averaged = "" if first.point_to_point else f",\nRMS over {WINDOW:g} s"
+    axes.set_ylabel(f"true error [{first.error_unit[0]}]{averaged}")
 
 
 def show_errors(axes: Axes, ensembles: Collection[Ensemble]) -> None:
@@ -298,8 +296,7 @@ def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Fi
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
     if not columns:
         return None
-    height = 1.2 + max(ROW, 1.6 / len(shown)) * len(shown)
-    figure = Figure(figsize=(layout.width, height), layout="constrained")
+    figure = Figure(figsize=(layout.width, 1.2 + max(ROW * len(shown), 1.6)), layout="constrained")
     panels = figure.subplots(len(shown), 3, sharex=True, sharey="col", squeeze=False)
     for line, (name, track) in zip(panels, shown.items(), strict=True):
         for number, column in enumerate(columns):

@@ -112,7 +112,6 @@
     pen.lineWidth = 1.6;
     pen.strokeRect(x - 5, y - 5, 10, 10);
     pen.fillStyle = "#000";
-    pen.textAlign = "left";
     pen.fillText(text, x + 9, y - 8);
   }
 

@@ -134,11 +134,8 @@ class Group:
 
     def select(self, *, point_to_point: bool) -> dict[str, Tracks]:
         """Return the tasks with a fixed target, or those with a moving reference."""
-        return {
-            task: tracks
-            for task, tracks in self.tasks.items()
-            if next(iter(tracks.values())).point_to_point == point_to_point
-        }
+        moves = {task for task, tracks in self.tasks.items() if longest(tracks).point_to_point}
+        return {task: tracks for task, tracks in self.tasks.items() if (task in moves) == point_to_point}
 
 
 def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
@@ -228,10 +225,9 @@ class Ensemble(Shown):
         """The error, (r, k) [`error_unit`]; along a curve its root mean square over `WINDOW`."""
         if self.point_to_point or not self.period < WINDOW:
             return self.error
-        rows = round(WINDOW / self.period)
         with np.errstate(invalid="ignore"):
             squares = pd.DataFrame(self.error.T**2).replace(math.inf, np.nan)
-            means = squares.rolling(rows, min_periods=1).mean().to_numpy().T
+            means = squares.rolling(round(WINDOW / self.period), min_periods=1).mean().to_numpy().T
         return np.where(np.isfinite(self.error), np.sqrt(means), self.error)
 
 
