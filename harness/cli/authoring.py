@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, PLANT, named_option, option, switch
+from servobench.harness.cli.options import CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 from servobench.plant.contract.files import write_atomically, write_csv
@@ -32,6 +32,7 @@ NEXT: Final = {  # kind of a new file -> the next commands
     "plant": ("check plant {}", "run --plant {}"),
 }
 COLOURS: Final = {"ok": "green", "failed": "bold red", "note": "yellow"}
+LOG = typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
 LEGEND: Final = (
     "error / motion: 1 is as good as to predict no motion; noise of the feature is left by the best Jacobian, too\n"
     "The log does not answer to the controller, so that this does not say how well it would have done."
@@ -42,7 +43,7 @@ def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")] = "",
     folder: Annotated[Path, option("FOLDER", "Folder for the files.")] = Path(),
-    aids: Annotated[bool, named_option("--aids", "", "A controller with the aids of the bench's methods.")] = False,
+    aids: Annotated[bool, switch("--aids", "A controller with the aids of the bench's methods.")] = False,
 ) -> None:
     """Write a commented controller or plant, and its test."""
     from importlib.metadata import packages_distributions
@@ -120,9 +121,7 @@ def check(
 
 
 def shadow(
-    log: Annotated[
-        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
-    ],
+    log: Annotated[Path, LOG],
     controller: Annotated[
         str | None, option(CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
@@ -161,9 +160,7 @@ def shadow(
 
 
 def identify(
-    log: Annotated[
-        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
-    ],
+    log: Annotated[Path, LOG],
     run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",

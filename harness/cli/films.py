@@ -96,7 +96,7 @@ def record(
         raise ConfigurationError(f"--out {out} must be a folder, or one film that ends in .{MP4} or .{GIF}")
     if film is not None and kinds not in (selection.ALL, film.suffix.removeprefix(".")):
         raise ConfigurationError(f"--out {film} names one film; leave --kinds {kinds} away, or name a folder")
-    wanted = selection.split_among("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
+    wanted = selection.split_names("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
@@ -121,7 +121,11 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or its only one, or carry out a new one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logs import find_run
+    from servobench.harness.config.settings import read_settings
     from servobench.harness.pictures.replay import logged_run
+    from servobench.harness.run.episode import run_experiment
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolution import check_settings
 
     if folder is not None:
         if given := new.given():
@@ -130,17 +134,6 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
         return logged_run(row, results.load_steps(folder, [row["run_id"]]))
     if run_id is not None:
         raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-    return _carried_out(new)
-
-
-def _carried_out(new: NewRun) -> LoggedRun:
-    """Carry out a run to be shown."""
-    from servobench.harness.config.settings import read_settings
-    from servobench.harness.pictures.replay import logged_run
-    from servobench.harness.run.episode import run_experiment
-    from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolution import check_settings
-
     names, settings = new.names(), read_settings(new.config, new.set_ or [])
     chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
     request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})

@@ -14,7 +14,7 @@ import typer
 from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
-from servobench.harness.cli.terminal import FAILED, console, say, writing
+from servobench.harness.cli.terminal import FAILED, print_rows, say, writing
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 
 if TYPE_CHECKING:
@@ -149,8 +149,6 @@ def validate(file: FileArgument) -> None:
 @fmu_app.command()
 def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
-    from rich.table import Table
-
     from servobench.fmus.inspection import read_information, shape_of
 
     with configuration_errors():
@@ -163,11 +161,11 @@ def info(file: FileArgument) -> None:
     say(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     for name, capabilities in information.interfaces.items():
         say(f"capabilities in {name}: {', '.join(capabilities) or 'none'}")
-    table = Table("name", "causality", "size", "unit", "start")
+    rows = []
     for each in described.modelVariables:
         size = " × ".join(map(str, shape_of(each))) or "1"
-        table.add_row(each.name, each.causality or "local", size, each.unit or "", _shortened(str(each.start or "")))
-    console.print(table)
+        rows.append((each.name, each.causality or "local", size, each.unit or "", _shortened(str(each.start or ""))))
+    print_rows(("name", "causality", "size", "unit", "start"), rows)
 
 
 def _shortened(text: str, width: int = 24) -> str:

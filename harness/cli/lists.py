@@ -108,8 +108,7 @@ def init(
 
     split = selection.split
     names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
-    nominal = read_mismatch("none")
-    requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
+    requests = [RunRequest(*each, read_mismatch("none"), 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
     settings.check_sections([*known_sections(), *names[0], *names[1], *names[2]])
     settings.check_running(["run", *names[0], *names[1], *names[2]])

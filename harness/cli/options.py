@@ -136,51 +136,32 @@ LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
 ROBOT_WORDS = (
     "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: UR calibration (.yaml), DH table or twin (.toml), .urdf."
 )
-RobotOption = Annotated[
-    str,
-    named_option(
-        "--robot",
-        ROBOT,
-        ROBOT_WORDS,
-        absent={
-            "claims": "the claims are those of the paper, which are about a UR5",
-            "suite": "challenges are graded on the UR5; compare and sweep take other arms",
-            "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
-        },
-    ),
-]
-CameraOption = Annotated[  # of every command that has --robot
-    Path | None,
-    named_option(
-        "--camera",
-        "FILE",
-        "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's.",
-        absent={
-            "claims": "the claims are those of the paper, which are about the bench's camera",
-            "suite": "a challenge names its camera in its file; compare and sweep take any",
-            "analyse": "its loops are those of the ball in 3-D before the bench's camera",
-            "tune": "methods are tuned with the bench's camera, and others take these settings; compare shows how they "
-            "do",
-        },
-    ),
-]
-SensingOption = Annotated[
-    str,
-    named_option(
-        "--sensing",
-        SENSING,
-        "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
-        absent={
-            "claims": "the claims are those of the paper, which are about the ball in 3-D",
-            "suite": "challenges are graded on the ball in 3-D; compare and sweep take other sensing",
-            "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
-            "compare shows how they do",
-            "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
-            "record": "films show the ball's way through space; figures of run --sensing show pixels",
-            "controllers": "settings of a controller are the same under all sensing",
-        },
-    ),
-]
+CAMERA_WORDS = "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's."
+SENSING_WORDS = "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand."
+NO_ROBOT = {
+    "claims": "the claims are those of the paper, which are about a UR5",
+    "suite": "challenges are graded on the UR5; compare and sweep take other arms",
+    "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+}
+NO_CAMERA = {
+    "claims": "the claims are those of the paper, which are about the bench's camera",
+    "suite": "a challenge names its camera in its file; compare and sweep take any",
+    "analyse": "its loops are those of the ball in 3-D before the bench's camera",
+    "tune": "methods are tuned with the bench's camera, and others take these settings; compare shows how they do",
+}
+NO_SENSING = {
+    "claims": "the claims are those of the paper, which are about the ball in 3-D",
+    "suite": "challenges are graded on the ball in 3-D; compare and sweep take other sensing",
+    "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
+    "compare shows how they do",
+    "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
+    "record": "films show the ball's way through space; figures of run --sensing show pixels",
+    "controllers": "settings of a controller are the same under all sensing",
+}
+RobotOption = Annotated[str, named_option("--robot", ROBOT, ROBOT_WORDS, NO_ROBOT)]
+# Every command that has --robot has --camera, too.
+CameraOption = Annotated[Path | None, named_option("--camera", "FILE", CAMERA_WORDS, NO_CAMERA)]
+SensingOption = Annotated[str, named_option("--sensing", SENSING, SENSING_WORDS, NO_SENSING)]
 PlantsOption = Annotated[str, option(PLANT.several(), LISTED.format("plants"))]
 ControllersOption = Annotated[str, option(CONTROLLER.several(), LISTED.format("controllers"))]
 TasksOption = Annotated[str, option(TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")]

@@ -59,8 +59,7 @@ def statistics(
             ]
         )
         return
-    if missing:
-        say(f"% {missing}" if latex else missing)
+    say(f"% {missing}" if latex and missing else missing)
     tables = statistics_tables(runs, metric)
     if latex:
         from servobench.harness.analysis.folder import latex_tables, methods_paragraph
@@ -79,7 +78,17 @@ def report(
 
     With figures, sortable tables and paths to turn; it needs no network.
     """
-    make_report(folder, out)
+    from servobench.harness.batch import results
+    from servobench.harness.pictures.report import write_report
+
+    say(results.describe_missing(folder))
+    began = time.monotonic()
+    with console.status("making the report"):
+        path = write_report(folder, out)
+        results.vouch(folder, [path])
+    seconds = time.monotonic() - began
+    took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
+    say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")
 
 
 def figures(
@@ -102,10 +111,10 @@ def figures(
     from servobench.harness.pictures.figures import FOLDER, KINDS, Choice, folder_figures
     from servobench.harness.pictures.style import ALL_FORMATS, Layout, check_tex, save_figure
 
-    formats = selection.split_among("format", format_, ALL_FORMATS)
-    kinds = selection.split_among("kind", kind, tuple(KINDS))
+    formats = selection.split_names("format", format_, ALL_FORMATS)
+    kinds = selection.split_names("kind", kind, tuple(KINDS))
     known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
-    shown = selection.split_among("controllers", controllers, known)
+    shown = selection.split_names("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):
         raise ConfigurationError(f"--names has {len(own)} names for {len(shown)} controllers: {', '.join(shown)}")
@@ -113,8 +122,7 @@ def figures(
         raise ConfigurationError(f"--names has one name for several controllers: {', '.join(own)}")
     if "pgf" in formats:
         check_tex()
-    if missing := results.describe_missing(folder):
-        say(missing)
+    say(results.describe_missing(folder))
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
     with console.status("drawing the figures"), writing(target):
@@ -125,28 +133,12 @@ def figures(
         ]
     if not files:
         results.check_steps(folder)
-        needed = (
-            "errors and paths are of moves, tracking is of curves, settling, effort and smoothness are of several runs"
+        raise ConfigurationError(
+            f"{folder} has no figure of {', '.join(kinds)}: errors and paths are of moves, tracking is of curves, "
+            "settling, effort and smoothness are of several runs"
         )
-        raise ConfigurationError(f"{folder} has no figure of {', '.join(kinds)}: {needed}")
     results.vouch(folder, files)
     say("\n".join(map(str, files)))
-
-
-def make_report(folder: Path, out: Path | None = None) -> None:
-    """Write the report and print its path and, if it took long, the time."""
-    from servobench.harness.batch import results
-    from servobench.harness.pictures.report import write_report
-
-    if missing := results.describe_missing(folder):
-        say(missing)
-    began = time.monotonic()
-    with console.status("making the report"):
-        path = write_report(folder, out)
-        results.vouch(folder, [path])
-    seconds = time.monotonic() - began
-    took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
-    say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")
 
 
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
@@ -175,8 +167,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     found = examine(folder)
     for finding in found.findings:
         say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
-    if line := missing_line(found.runs, found.wanted):
-        say(line)
+    say(missing_line(found.runs, found.wanted))
     if found.left_out:
         more = f" and {len(found.left_out) - MAX_FAULTS} more" if len(found.left_out) > MAX_FAULTS else ""
         say(f"not checked, as SHA256SUMS does not list it: {', '.join(found.left_out[:MAX_FAULTS])}{more}")
@@ -196,8 +187,7 @@ def export(
     from servobench.harness.analysis.exports import export_folder
     from servobench.harness.batch import results
 
-    if missing := results.describe_missing(folder):
-        say(missing)
+    say(results.describe_missing(folder))
     files = export_folder(folder, out, format_)
     say(f"{len(files)} files in {out}")
 
@@ -206,8 +196,7 @@ def say_aids(folder: Path) -> None:
     """Print which controllers of a folder have the aids, where it has several."""
     from servobench.harness.analysis.folder import describe_controllers
 
-    if line := describe_controllers(folder):
-        say(line)
+    say(describe_controllers(folder))
 
 
 def print_faults(folder: Path, runs: pd.DataFrame) -> None:

@@ -11,14 +11,12 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option, switch
-from servobench.harness.cli.results import judge, make_report, print_faults, say_aids
+from servobench.harness.cli.results import judge, print_faults, report, say_aids
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from servobench.harness.batch.campaign import Campaign, Execution
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
@@ -123,8 +121,7 @@ def merge(
     from servobench.harness.batch import campaign, results
 
     count = campaign.merge(folders, out, say)
-    if missing := results.describe_missing(out):
-        say(missing)
+    say(results.describe_missing(out))
     say(f"{count} runs in {out / results.RUNS}")
 
 
@@ -161,39 +158,32 @@ def _carry_out(
     campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
+    from servobench.harness.analysis.tables import summary_legend, summary_tables
+    from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.cli.progress import watching
+    from servobench.harness.config.installation import missing_extra
 
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
-        runs = _show(folder, latest=out is None, with_figures=with_figures, with_report=with_report)
+        runs = results.load_runs(folder)
+        print_tables(summary_tables(runs), summary_legend(runs))
+        say_aids(folder)
+        print_faults(folder, runs)
+        if out is None:
+            point_latest(folder)
+        if with_figures:
+            from servobench.harness.pictures.figures import draw_figures
+
+            with console.status("drawing the figures"):
+                figures = draw_figures(folder)
+                results.vouch(folder, figures)
+        say(f"tables and {len(figures)} figures in {folder}" if with_figures else f"tables in {folder}")
+        if with_report:
+            try:
+                report(folder)
+            except (ConfigurationError, ImportError) as error:  # the runs are safe, and the report can be made again
+                missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
+                say(f"no report: {missing or error}")
     judge(folder, [runs], strict=strict)
-
-
-def _show(folder: Path, *, latest: bool, with_figures: bool, with_report: bool) -> pd.DataFrame:
-    """Print the tables of a folder whose runs are finished, draw its figures and its report, and return its runs."""
-    from servobench.harness.analysis.tables import summary_legend, summary_tables
-    from servobench.harness.batch import results
-    from servobench.harness.config.installation import missing_extra
-
-    runs = results.load_runs(folder)
-    print_tables(summary_tables(runs), summary_legend(runs))
-    say_aids(folder)
-    print_faults(folder, runs)
-    if latest:
-        point_latest(folder)
-    if with_figures:
-        from servobench.harness.pictures.figures import draw_figures
-
-        with console.status("drawing the figures"):
-            figures = draw_figures(folder)
-            results.vouch(folder, figures)
-    say(f"tables and {len(figures)} figures in {folder}" if with_figures else f"tables in {folder}")
-    if with_report:
-        try:
-            make_report(folder)
-        except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
-            missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
-            say(f"no report: {missing or error}")
-    return runs

@@ -21,11 +21,8 @@ class Names(NamedTuple):
 
     known: Callable[[], Sequence[str]]  # returns all of them
     find: Callable[[str], Any]  # refuses a wrong word; a text that it returns is the name that the word stands for
-    # the kind of plants and controllers, of which those of third parties are tried where `all` stands for them; None
-    # for other kinds
-    tried: Word | None = None
-    # returns the names that a shell offers for a word, where names are put together from parts
-    begun: Callable[[str], Iterable[str]] | None = None
+    tried: Word | None = None  # plants or controllers, of which those of third parties are tried if `all` is meant
+    begun: Callable[[str], Iterable[str]] | None = None  # returns the offers for a word, where names have parts
 
 
 @cache
@@ -90,8 +87,7 @@ def _begun_mismatches(word: str) -> Iterable[str]:
 def _find_robot(word: str) -> str:
     from servobench.harness.run.request import find_robot
 
-    if note := find_robot(word).note:
-        say(note)
+    say(find_robot(word).note)
     return word
 
 
@@ -176,23 +172,11 @@ def split_words(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def split_among(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
-    """Split a comma-separated list of words out of `known`, and refuse another one with a suggestion."""
-    from servobench.plant.contract.settings import suggest
-
-    def find(word: str) -> str:
-        if word not in known:
-            raise ConfigurationError(f"--{option}: unknown {word!r}: {suggest(word, known)}")
-        return word
-
-    return split_names(option, text, known, find)
-
-
 def split_names(
     option: str,
     text: str,
     known: Sequence[str],
-    find: Callable[[str], Any],
+    find: Callable[[str], Any] | None = None,
     usable: Callable[[], Iterable[str]] | None = None,
 ) -> tuple[str, ...]:
     """Split a comma-separated list of names, and refuse an empty one and a name that stands in it twice.
@@ -201,15 +185,19 @@ def split_names(
         option: by which it was given, without dashes.
         text: the list.
         known: all names.
-        find: see `Names`.
+        find: see `Names`; None if all words are known, and another one is refused with a suggestion.
         usable: returns the names that `all` stands for; None for those that are known.
     """
+    from servobench.plant.contract.settings import suggest
+
     names: list[str] = []
     for word in split_words(text):
         if word == ALL:
             names += known if usable is None else usable()
+        elif find is not None or word in known:
+            names.append(word if find is None else _chosen(find, word))
         else:
-            names.append(_chosen(find, word))
+            raise ConfigurationError(f"--{option}: unknown {word!r}: {suggest(word, known)}")
     if not names:
         raise ConfigurationError(f"--{option} is empty; valid: {', '.join(known)}")
     for name in names:

@@ -387,12 +387,8 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
     from servobench.controllers.servo import ServoController
     from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
 
-    rows: list[tuple[float, float]] = []
-    for run in runs:
-        warm = warm_up(run)
-        if isinstance(warm.controller, ServoController):
-            loop = SmallLoop(warm)
-            rows.append((loop.gain_limit(), loop.latency_limit()))
-        else:
-            rows.append((float("nan"), float("nan")))
+    rows = []
+    for warm in map(warm_up, runs):
+        loop = SmallLoop(warm) if isinstance(warm.controller, ServoController) else None
+        rows.append((float("nan"), float("nan")) if loop is None else (loop.gain_limit(), loop.latency_limit()))
     return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])

@@ -26,14 +26,8 @@ INPUT_ERROR = 2  # exit code
 INTERRUPTED = 130  # exit code after Ctrl-C
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
-KEYS = (
-    "controller",
-    "mismatch",
-    "noise factor",
-    "latency [ms]",
-    "period [ms]",
-    "A − B",
-)  # first columns, by which a row is known
+# The first columns, by which a row is known.
+KEYS = ("controller", "mismatch", "noise factor", "latency [ms]", "period [ms]", "A − B")
 LEFT = (*KEYS, "failures", "outcome")  # columns of words
 WHOLE = ("controller", "A − B")  # columns whose cells are not broken over lines
 CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
@@ -157,8 +151,9 @@ def end_interrupted(kept: str, going_on: str) -> NoReturn:
 
 
 def say(line: str) -> None:
-    """Print a line as it is, however long: it may hold names, paths and brackets of users."""
-    console.print(harmless(line), soft_wrap=True, markup=False, highlight=False)
+    """Print a line as it is, however long: it may hold names, paths and brackets of users. An empty one is left out."""
+    if line:
+        console.print(harmless(line), soft_wrap=True, markup=False, highlight=False)
 
 
 def print_json(value: object) -> None:
