@@ -97,21 +97,16 @@ def check(
 
     if subject == ["plant"]:
         raise ConfigurationError("check plant needs a plant, such as servobench check plant ./cell.py")
-    if subject[0] == "plant" and len(subject) == 2:
-        checks: Checks = check_plant
-        name = subject[1]
-    elif len(subject) == 1:
-        checks, name = check_controller, subject[0]
-    else:
+    is_plant, name = subject[0] == "plant", subject[-1]
+    if len(subject) != 1 + is_plant:
         raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
+    checks: Checks = check_plant if is_plant else check_controller
     findings: list[Finding] = []
 
     def hear(finding: Finding) -> None:
         findings.append(finding)
-        console.print(
-            Text.assemble((f"{finding.verdict:7s}", COLOURS[finding.verdict]), f"{finding.check:15s}", finding.text),
-            soft_wrap=True,
-        )
+        verdict = f"{finding.verdict:7s}", COLOURS[finding.verdict]
+        console.print(Text.assemble(verdict, f"{finding.check:15s}", finding.text), soft_wrap=True)
 
     run_checks(checks, name, limit, hear)
     failed = sum(finding.verdict == "failed" for finding in findings)

@@ -51,17 +51,6 @@ class NewRun:
     ] = None
     config: Annotated[Path | None, option("FILE", "New run: TOML file with settings.")] = None
 
-    def given(self) -> list[str]:
-        """Return the options of it that were given."""
-        return [f"--{name.rstrip('_')}" for name, value in vars(self).items() if value not in (None, [])]
-
-    def names(self) -> dict[str, Any]:
-        """Return the names and the seed of the run, with defaults for those that were not given."""
-        from servobench.harness.config.registry import rendered_plant
-
-        given = {name: value for name in ("plant", *RECORDED) if (value := getattr(self, name)) is not None}
-        return {"plant": rendered_plant(self.plant), **RECORDED, **given}
-
 
 def record(
     folder: Annotated[
@@ -121,20 +110,24 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or its only one, or carry out a new one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logs import find_run
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolution import check_settings
 
+    given = {name: value for name, value in vars(new).items() if value not in (None, [])}
     if folder is not None:
-        if given := new.given():
-            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+        if given:
+            name = next(iter(given)).rstrip("_")
+            raise ConfigurationError(f"--{name} belongs to a new run; a run of {folder} is named by --run")
         row = find_run(folder, run_id)
         return logged_run(row, results.load_steps(folder, [row["run_id"]]))
     if run_id is not None:
         raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-    names, settings = new.names(), read_settings(new.config, new.set_ or [])
+    names = {name: given.get(name, usual) for name, usual in {"plant": rendered_plant(new.plant), **RECORDED}.items()}
+    settings = read_settings(new.config, new.set_ or [])
     chosen = {each: selection.choose(f"{each}s", names[each]) for each in ("plant", "controller")}
     request = RunRequest(**names | chosen | {"mismatch": read_mismatch(names["mismatch"])})
     check_settings(settings, [request.plant, request.controller, request.task])

@@ -113,15 +113,12 @@ def init(
     settings.check_sections([*known_sections(), *names[0], *names[1], *names[2]])
     settings.check_running(["run", *names[0], *names[1], *names[2]])
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
-    titles = {"run": "common to all plants, controllers and tasks"} | {
-        name: f"{kind}: {find(name).summary}"
-        for (kind, find), each in zip(finds.items(), names, strict=True)
-        for name in each
-    }
+    titles = {"run": "common to all plants, controllers and tasks"}
+    for (kind, find), each in zip(finds.items(), names, strict=True):
+        titles |= {name: f"{kind}: {find(name).summary}" for name in each}
     sections, defaults = (resolve_sections(requests, each, to_run=False) for each in (settings, Settings()))
-    text = configuration_file(
-        sections, defaults, titles, f"run --config {'FILE' if file == STANDARD_OUTPUT else file.name}"
-    )
+    shown = "FILE" if file == STANDARD_OUTPUT else file.name
+    text = configuration_file(sections, defaults, titles, f"run --config {shown}")
     if file == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
@@ -178,14 +175,11 @@ def _show_settings(section: str, config: object, *, as_json: bool) -> None:
 
     found = list(describe_settings(config))
     if as_json:
-        facts = ("unit", "allowed", "meaning")
-        print_json(
-            [
-                {"setting": f"{section}.{each.key}", "default": plain(each.value)}
-                | {fact: getattr(each, fact) for fact in facts}
-                for each in found
-            ]
-        )
+        rows = []
+        for each in found:
+            facts = {"unit": each.unit, "allowed": each.allowed, "meaning": each.meaning}
+            rows.append({"setting": f"{section}.{each.key}", "default": plain(each.value), **facts})
+        print_json(rows)
         return
     if not found:
         say(f"{section} has no settings")

@@ -126,11 +126,9 @@ def figures(
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
     with console.status("drawing the figures"), writing(target):
-        files = [
-            path
-            for named in folder_figures(folder, choice)
-            for path in save_figure(named.figure, target / named.stem, formats, exact_width=True)
-        ]
+        files: list[Path] = []
+        for named in folder_figures(folder, choice):
+            files += save_figure(named.figure, target / named.stem, formats, exact_width=True)
     if not files:
         results.check_steps(folder)
         raise ConfigurationError(

@@ -176,23 +176,21 @@ def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, siz
     """Yield the figures of a group: of its moves, of its curves, and of both."""
     moves, runs, everything = group.select(point_to_point=True), group.runs, tuple(group.tasks)
     until = {task: shown_until(ensembles[task]) for task in everything}
-    for words, part in _parts(moves, size):
-        yield _Plan("errors", words, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
-        yield _Plan(
-            "features", words, part, partial(draw_features, {task: moves[task] for task in part}, until, styles)
-        )
+    for text, part in _parts(moves, size):
+        yield _Plan("errors", text, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
+        yield _Plan("features", text, part, partial(draw_features, {task: moves[task] for task in part}, until, styles))
     heads = divisions(name for tracks in moves.values() for name in tracks)
-    for words, part in _parts(moves, max(1, size // len(heads))):
-        yield _Plan("paths", words, part, partial(draw_paths, {task: moves[task] for task in part}, styles))
+    for text, part in _parts(moves, max(1, size // len(heads))):
+        yield _Plan("paths", text, part, partial(draw_paths, {task: moves[task] for task in part}, styles))
     for task, tracks in group.select(point_to_point=False).items():
         yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
         yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
-    for words, part in _parts(runs["task"].unique() if several else (), size):
+    for text, part in _parts(runs["task"].unique() if several else (), size):
         chosen = runs[runs["task"].isin(part)]
         for kind in FIGURES:
-            yield _Plan(kind, words, part, partial(draw_measures, chosen, kind, styles))
+            yield _Plan(kind, text, part, partial(draw_measures, chosen, kind, styles))
     yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
         yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until[task]))

@@ -81,14 +81,12 @@ def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
         axes.plot(1000.0 * loop.arm.latency, 1.0, color="white", marker="X", markersize=9, markeredgecolor="black",
                   clip_on=False, zorder=10)  # fmt: skip
         axes.set(title=loop.name, ylim=(FACTORS[0], FACTORS[-1]))
+        axes.set(xlabel="latency of the camera [ms]", ylabel="factor on the command")
+        axes.label_outer()
         axes.grid(visible=False)
         plain_logarithms(axes)
     for axes in grid.flat[len(loops) :]:
         axes.set_axis_off()
-    for axes in grid[-1]:
-        axes.set_xlabel("latency of the camera [ms]")
-    for axes in grid[:, 0]:
-        axes.set_ylabel("factor on the command")
     figure.colorbar(mpl.cm.ScalarMappable(norm, "viridis_r"), ax=grid, label="M_s", format="%g")
     return figure
 

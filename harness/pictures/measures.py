@@ -61,9 +61,7 @@ def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there. `kind` is one
     of `FIGURES`; of its metrics those without any value are left out. A narrow layout is for a single task.
     """
-    rows = [
-        name for name, metric in METRICS.items() if metric.figure == kind and name in runs and runs[name].notna().any()
-    ]
+    rows = [name for name, each in METRICS.items() if each.figure == kind and name in runs and runs[name].notna().any()]
     if not rows:
         return None
     alone = runs["task"].nunique() == 1

@@ -1,7 +1,6 @@
 "use strict";
 // The page's tables, contents and runs. Everything works on text: nothing from a results folder is read as markup.
 const data = JSON.parse(document.getElementById("data").textContent);
-const NS = "http://www.w3.org/2000/svg";
 const FIRST_ROWS = 25;
 
 function filled(made, text, attributes) {
@@ -10,7 +9,7 @@ function filled(made, text, attributes) {
   return made;
 }
 const element = (name, text, attributes = {}) => filled(document.createElement(name), text, attributes);
-const drawn = (name, attributes, text = "") => filled(document.createElementNS(NS, name), text, attributes);
+const drawn = (name, attributes, text = "") => filled(document.createElementNS("http://www.w3.org/2000/svg", name), text, attributes);
 
 // Contents: always open beside the page, folded above it.
 const contents = document.querySelector("nav details");

@@ -24,7 +24,7 @@ from servobench.harness.analysis.folder import describe_controllers, describe_fo
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import KINDS, page_figures
-from servobench.harness.pictures.style import NARROW, WIDE, Drawing, MethodStyle, drawing_of, method_styles
+from servobench.harness.pictures.style import NARROW, WIDE, Drawing, drawing_of, method_styles
 from servobench.harness.pictures.tracks import COLUMNS, Shown, Tracks, label_of, load_groups, load_tracks, longest
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
@@ -198,7 +198,10 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
         "swatches": {
-            name: {"colour": style.colour, "dash": _dash(style)}
+            name: {
+                "colour": style.colour,
+                "dash": DASHES[style.line] if style.line in DASHES else [2.0 * length for length in style.line[1]],
+            }
             for name, style in method_styles(shown["controller"].astype(str)).items()
         },
         "views": views,
@@ -263,12 +266,6 @@ def _points(points: FloatArray) -> list[list[float | None]]:
     chosen = points[np.isfinite(points).all(axis=1)]
     kept = np.unique([*range(0, len(chosen), step), *([len(chosen) - 1] if len(chosen) else [])]).astype(int)
     return [[rounded(float(x)) for x in point] for point in chosen[kept]]
-
-
-def _dash(style: MethodStyle) -> list[float]:
-    if isinstance(style.line, str):
-        return list(DASHES.get(style.line, []))
-    return [2.0 * float(length) for length in style.line[1]]
 
 
 class Cell(NamedTuple):

@@ -141,8 +141,6 @@ class MethodStyle:
 
 
 Styles = dict[str, MethodStyle]
-
-
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
     "regression_mfac": MethodStyle(WINE, "-", "*"),
