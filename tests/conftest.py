@@ -1,7 +1,5 @@
 """Numpy errors raise in tests, examples stay the same, the user's cache is not touched, and interrupts arrive."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Every method on every plant still does what it did, to ten times what rounding does; `kit.golden` keeps the table."""
 
-from __future__ import annotations
-
 import platform
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Search spaces, the objective, the committed values and their check."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from dataclasses import replace

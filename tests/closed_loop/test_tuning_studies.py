@@ -1,7 +1,5 @@
 """The coordinate search, studies that go on where they stopped, and the files they leave."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

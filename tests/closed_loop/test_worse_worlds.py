@@ -4,8 +4,6 @@ Runs are deterministic. Another processor rounds differently, which may shift a 
 each method settles on 100 robots is measured by `make nightly`.
 """
 
-from __future__ import annotations
-
 import math
 
 import pytest

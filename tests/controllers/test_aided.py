@@ -1,7 +1,5 @@
 """A controller of one's own with aids: the chain around it is that of a composed controller."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Natural units: what a controller is told of features, divided by their natural size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

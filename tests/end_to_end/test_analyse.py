@@ -1,7 +1,5 @@
 """`servobench analyse` as a user meets it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

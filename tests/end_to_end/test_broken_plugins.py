@@ -1,7 +1,5 @@
 """Broken plug-ins, installed as entry points: one right line each, in the lists, in a run and beside all others."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The answers to the paper's claims: the rules on tables with a known outcome, and the command on real runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

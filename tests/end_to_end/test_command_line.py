@@ -1,7 +1,5 @@
 """The command line as a user meets it: what it prints, what it leaves on disk, and how it refuses bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Exported controllers in FMPy's hands: equal to the original over a run, saved, reset, in steps of other lengths."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache

@@ -1,7 +1,5 @@
 """The pages of documentation: their links, the code that they name, and the examples that they promise to run."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import json

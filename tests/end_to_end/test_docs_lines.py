@@ -3,8 +3,6 @@
 What pages show with a prompt is carried out whole, by `test_docs.py`.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from contextlib import nullcontext, suppress

@@ -1,7 +1,5 @@
 """The tables of the documentation say what the code does: settings, columns, diagnostics, statuses, profiles, keys."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Environments of every task and of every plant as Gymnasium checks them, and runs that fail at the start."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scripts in docs/examples run as they stand and print what they promise."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """The command line starts without heavy packages, works without extras, and names the extra that is missing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -5,8 +5,6 @@ block is pasted, also those without a prompt, which have to end with exit code 0
 `make nightly`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Bad FMUs as a user meets them: one line, exit code 2 or a named status, and nothing left behind."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from pathlib import Path

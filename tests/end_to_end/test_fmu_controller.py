@@ -1,7 +1,5 @@
 """FMUs as controllers by a mapping: ours equal the originals, foreign ones close a loop, bad ones are refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """FMUs that offer model exchange only: the exported UR5 without its co-simulation side agrees with that side."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ET
 import zipfile

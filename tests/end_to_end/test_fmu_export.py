@@ -1,7 +1,5 @@
 """The exported UR5: validation, agreement with numpy, derivatives, saved states, equal bytes, and what may go wrong."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

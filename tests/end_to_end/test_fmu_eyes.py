@@ -1,7 +1,5 @@
 """Sensing set-ups as FMUs: against the kinematic eye, by the plant and by FMPy."""
 
-from __future__ import annotations
-
 import fmpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Parameters of every type, arrays whose sizes are set, results of single precision, and steps that an FMU can take."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The FMU plant: a foreign FMU in a closed loop, what may be wrong with one, and what must not be left behind."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import zipfile

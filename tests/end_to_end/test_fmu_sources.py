@@ -1,7 +1,5 @@
 """The C sources of exported FMUs, of a plant and of a controller: in clang-tidy's eyes, and under the sanitizers."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -5,8 +5,6 @@ Reference FMUs (folder `fmusim` up to v0.0.39), the checker that of modelica-too
 built from source; their tests are skipped where neither the path nor FMUSIM or FMUCHECK in the environment has them.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

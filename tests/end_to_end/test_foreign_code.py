@@ -1,7 +1,5 @@
 """The code of a foreign FMU runs in no process but one of its own, whatever command reads the FMU."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import zipfile

@@ -1,7 +1,5 @@
 """What a plug-in does to one run costs no other run, whichever command carries the runs out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

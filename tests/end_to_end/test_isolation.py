@@ -1,7 +1,5 @@
 """Whatever a controller does, each of its runs is a row, no other run notices, and nothing of it stays behind."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """The study of filters and noise: its commands in any set-up, and its tables and picture from made-up runs."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

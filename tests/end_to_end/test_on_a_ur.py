@@ -1,7 +1,5 @@
 """The client `ur-rtde` itself moves a served plant, by docs/examples/on_a_ur.py and by calls of its own."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

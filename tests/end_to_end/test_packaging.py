@@ -1,7 +1,5 @@
 """What is installed: one package, with everything in it that is read at run time."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 The long campaign is `python -m night.fuzzing`; FOUND holds its finds.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files and folders that may not be read or written: each is one right line, and nothing is left half written."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

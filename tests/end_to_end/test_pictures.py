@@ -1,7 +1,5 @@
 """The figures of made-up folders: what is drawn, that it is labelled, and that oddities do not spoil it."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

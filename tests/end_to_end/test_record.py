@@ -1,7 +1,5 @@
 """Films and snapshots of runs, from the log alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """`make results`: studies carried out, gone on with, tried with few robots, stored and compared with what is stored."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

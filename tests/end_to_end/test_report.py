@@ -1,7 +1,5 @@
 """The report: a page of every kind of folder, which works in a browser without a network; and the notebook."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

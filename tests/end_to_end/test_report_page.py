@@ -1,7 +1,5 @@
 """The report in a browser, as a reader meets it: three widths, light and dark, printed, and fed with hostile texts."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whatever texts a foreign folder holds, the report has the tags of a harmless one and the texts are only texts."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 

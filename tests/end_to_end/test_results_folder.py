@@ -1,7 +1,5 @@
 """A results folder under attack: by a second process, a full disk, a kill at any operation, and hands."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Other robots in the plants that are compiled and rendered, by `servobench fmu …`, and in pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

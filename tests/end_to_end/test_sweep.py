@@ -1,7 +1,5 @@
 """A sweep gives the same table however it is interrupted, and no run is lost."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """`servobench tune` as a user meets it."""
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -1,7 +1,5 @@
 """The C compiler that is taken, where CC may hold options, and the folders of libraries in an FMU."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 

@@ -1,7 +1,5 @@
 """The exported UR5 as a model: agreement with numpy and fmpy, derivatives, saved states, reset, refusals."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The exported FMU to the letter of the standard, with fmpy as importer: times, parameters, ranges, stops, states."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 import zipfile
 

@@ -1,7 +1,5 @@
 """The model-exchange side of an FMU read back: true and nominal models of robots whose equations nobody has."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import casadi

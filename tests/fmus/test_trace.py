@@ -1,7 +1,5 @@
 """Numpy code that is recorded as expressions: equal to the code itself, and what cannot be recorded says why."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import casadi

@@ -1,7 +1,5 @@
 """Plants of users, given by the place of their code or as classes: found, run, checked, and refused in one line."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """`import servobench` as a user's script sees it."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

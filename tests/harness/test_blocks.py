@@ -1,7 +1,5 @@
 """Blocks of runs: the same rows however runs are put into blocks, and whatever becomes of the blocks."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

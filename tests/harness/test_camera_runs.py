@@ -1,7 +1,5 @@
 """Runs with a user's camera: features within its image, side by side, from a folder that is resumed, and refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

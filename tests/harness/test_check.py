@@ -1,7 +1,5 @@
 """The checks of controllers: a broken one fails the one right check with the one right line, a whole one none."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Tuned values stand in for the defaults of the classes wherever the harness builds a controller."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

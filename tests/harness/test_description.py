@@ -1,7 +1,5 @@
 """The configuration file that `servobench init` writes."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import replace

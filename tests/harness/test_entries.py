@@ -1,7 +1,5 @@
 """Controllers of users, given by the place of their code or as objects: found, named, and refused in one line."""
 
-from __future__ import annotations
-
 import re
 import sys
 

@@ -1,7 +1,5 @@
 """The exit codes of the table in docs/results.md, and what is printed with them."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

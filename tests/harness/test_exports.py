@@ -1,7 +1,5 @@
 """Steps of runs for other tools, read back by readers that are not ours."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What figures show, on ensembles and tracks made by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Whatever a stranger's results folder holds, commands write only where the user said, and run nothing in it."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

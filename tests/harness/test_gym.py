@@ -1,7 +1,5 @@
 """The environment of Gymnasium: what its checker says, and that episodes are runs of the bench, to the bit."""
 
-from __future__ import annotations
-
 import pickle
 import re
 

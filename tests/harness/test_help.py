@@ -1,7 +1,5 @@
 """What `servobench` says about itself: help, version, and the refusal of calls that cannot be understood."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated
 

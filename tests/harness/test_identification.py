@@ -1,7 +1,5 @@
 """Robots identified from logs of plants whose truth is known, and mistakes of logs that are named."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What is damaged is named in one line by every command, found before anything is computed, and alone made again."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

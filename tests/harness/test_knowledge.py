@@ -1,7 +1,5 @@
 """Trained networks come from the cache, which trains once for each configuration and model, and again after damage."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

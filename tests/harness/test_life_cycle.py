@@ -4,8 +4,6 @@ A run of a seed has one observation after k periods, however it got there: the m
 demands them again.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import settings

@@ -1,7 +1,5 @@
 """What a run may take, whose code is kept apart, and the processes below one."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

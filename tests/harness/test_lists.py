@@ -1,7 +1,5 @@
 """What there is, listed for readers and for programs, and completed by the shell, also behind colons."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One process at a time in a results folder, and who it is."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

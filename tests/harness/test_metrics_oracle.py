@@ -1,7 +1,5 @@
 """Every metric of a random log against its definition, written out row by row."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

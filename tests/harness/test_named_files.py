@@ -1,7 +1,5 @@
 """The files that a batch reads because a user named them: found, and looked at again when a folder is resumed."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

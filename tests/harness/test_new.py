@@ -1,7 +1,5 @@
 """`servobench new`: what it writes runs, keeps the contract, and overwrites nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The tables of a page, whose answers are known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

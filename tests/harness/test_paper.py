@@ -1,7 +1,5 @@
 """Tables and methods of a results folder in LaTeX."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Bounds are given the kinematics of rippled gears; what has no gears, tool or turning camera says so in one line."""
 
-from __future__ import annotations
-
 import casadi
 import numpy as np
 import pytest

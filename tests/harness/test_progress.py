@@ -1,7 +1,5 @@
 """Lines about long commands, for pipes and files."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

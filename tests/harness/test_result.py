@@ -1,7 +1,5 @@
 """How a run ended: the place of an error in the reason, and its trace in the log of failures."""
 
-from __future__ import annotations
-
 import ctypes
 import sys
 from pathlib import Path

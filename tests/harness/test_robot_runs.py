@@ -1,7 +1,5 @@
 """Runs with another robot than the UR5: names, tables, tasks, and what cannot be put together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

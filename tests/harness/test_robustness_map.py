@@ -1,7 +1,5 @@
 """The robustness map: its cells, its tables, its command."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

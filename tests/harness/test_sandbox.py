@@ -1,7 +1,5 @@
 """Sandboxes: calls with their answers, guards that do not start or are ended meanwhile, and guards that are stopped."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

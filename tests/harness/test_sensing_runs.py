@@ -1,7 +1,5 @@
 """Runs under sensing set-ups: units, tasks, views, pose errors, and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Here a client speaks bytes; tests/end_to_end/test_on_a_ur.py talks to the server by `ur-rtde` itself.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """A controller beside a logged run: its own run gives its own commands, and the log answers to nobody."""
 
-from __future__ import annotations
-
 import itertools
 import re
 

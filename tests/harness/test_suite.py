@@ -1,7 +1,5 @@
 """Challenges as files, their scores by hand, and the command `suite`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables of runs whose answer is known."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

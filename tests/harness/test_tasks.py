@@ -1,7 +1,5 @@
 """Tasks of users: a file, a module or a published entry point brings one, and each refusal is one line."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The sentence with which a report begins, of runs whose result is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

@@ -1,7 +1,5 @@
 """A hundred wrong inputs over all commands: each is one right line and exit code 2, and nothing is written."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

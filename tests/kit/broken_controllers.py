@@ -2,8 +2,6 @@
 
 # ruff: noqa: E501 - a case a line
 
-from __future__ import annotations
-
 from kit.own import WHOLE
 
 STEP = "        return servobench.Command(np.zeros(self.n))\n"

@@ -1,7 +1,5 @@
 """A page in headless Chromium, over the DevTools protocol on a pair of pipes: no driver and no port."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """The command line as a user meets it, within the process of the test and in processes of its own."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

@@ -1,7 +1,5 @@
 """Carries out the console sessions that pages show, and compares what they print with what the page says."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import textwrap

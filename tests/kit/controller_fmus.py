@@ -1,7 +1,5 @@
 """Exported controllers: each is compiled once for a version of FMI, by whichever process needs it first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads the project's pages for tests: links, headings, tables and blocks of code."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """An FMU as FMPy drives it, of either version, by the names of its variables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results folders made up for tests: quick, and with whatever oddity is wanted."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -6,8 +6,6 @@ progress, 5 initialisation fails, 6 it asks to end the simulation (FMI 3), 7 res
 error.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

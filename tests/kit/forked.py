@@ -1,7 +1,5 @@
 """The command line in forks of a process that has all packages in memory but the extras."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import dataclass

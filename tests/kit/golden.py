@@ -7,8 +7,6 @@ the largest deviation among the kernels of OpenBLAS, numpy's plain loops and a s
 at least `MIN_SPREAD`. The table is renewed by this file, which prints the line that CHANGELOG.md is then to have.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Rows of runs side by side, compared with those of each run alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

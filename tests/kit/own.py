@@ -1,7 +1,5 @@
 """Controllers as users write them: a class in a file, whole or broken."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 WHOLE = '''

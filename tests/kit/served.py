@@ -1,7 +1,5 @@
 """A served plant in a thread of this process, and a client of RTDE that speaks bytes."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import os

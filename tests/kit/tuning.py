@@ -1,7 +1,5 @@
 """Tuning in small: few runs, and runs whose cost is a formula."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

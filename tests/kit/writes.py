@@ -1,7 +1,5 @@
 """What a command opens for writing, renames, removes or starts, by an audit hook of Python."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The bench around any world: limits, delay, noise, latency, lost frames, and saved states."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

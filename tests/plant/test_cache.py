@@ -1,7 +1,5 @@
 """The cache: entries are made once, verify themselves, and are made anew where they are damaged."""
 
-from __future__ import annotations
-
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor

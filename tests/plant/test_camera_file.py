@@ -1,7 +1,5 @@
 """A user's camera: files of it and their faults, its projection against OpenCV, and its set-ups."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The lines that vouch for the files of a results folder: as they stand on the disk, and what they say of a file."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

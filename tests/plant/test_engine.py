@@ -1,7 +1,5 @@
 """PyBullet's banner is kept back, and nothing else is."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a foreign archive may hold: bombs, damage, links and names that lead elsewhere are refused in one line."""
 
-from __future__ import annotations
-
 import re
 import stat
 import struct

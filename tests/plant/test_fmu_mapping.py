@@ -1,7 +1,5 @@
 """Mappings of FMU variables in TOML files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Coloured marks in drawn images, and the lens, without an engine."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

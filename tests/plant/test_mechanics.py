@@ -1,7 +1,5 @@
 """Gear ripple, backlash and a flexible tool: hand-computed steps, closed forms, and both plants that have them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Noise of the sensor against closed forms and SciPy, with fixed seeds; and what each part of it does on the bench."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import partial

@@ -1,7 +1,5 @@
 """Runs side by side: a lane of a plant has the same bits alone, with other neighbours and after others were dropped."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

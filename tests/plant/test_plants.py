@@ -1,7 +1,5 @@
 """The contract of a plant, held against every registered one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

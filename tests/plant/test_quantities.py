@@ -1,7 +1,5 @@
 """Quantities are read in any of their units, and answered in the unit in which they were written."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

@@ -1,7 +1,5 @@
 """Robots by name and by file: the makers' numbers, the readers of files, and the workspace that is found for them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

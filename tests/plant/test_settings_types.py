@@ -1,7 +1,5 @@
 """Settings are checked on construction, and every complaint is one line."""
 
-from __future__ import annotations
-
 import pickle
 import re
 from dataclasses import FrozenInstanceError, replace

@@ -1,7 +1,5 @@
 """Sensing set-ups: their features and Jacobians against OpenCV, CasADi, finite differences and geometry."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

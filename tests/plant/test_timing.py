@@ -1,7 +1,5 @@
 """Physical time: the same world at every control rate, with features late by exactly the latency."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

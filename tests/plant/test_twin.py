@@ -1,7 +1,5 @@
 """Twins: robots that are drawn from the posterior of a file."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
