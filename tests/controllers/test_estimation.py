@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorded, Recorder, jacobian_network, plant_spec
+from kit.toy import KNOWLEDGE, NETWORK, PERIOD, TURN, M, N, Recorded, Recorder, late_features, plant_spec
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
@@ -14,10 +13,7 @@ from servobench.controllers.estimators.projection import BroydenConfig, Projecti
 from servobench.controllers.stages.estimation import Estimation
 from servobench.plant.contract.signals import Observation
 
-TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
 NONE = Delays(0.0, 0.0, 0.0)
-NETWORK = jacobian_network(N, M, units=6)
-NETWORK = dataclasses.replace(NETWORK, weights=0.3 * NETWORK.weights)
 MODELLED = dataclasses.replace(KNOWLEDGE, nominal_jacobian=NETWORK.jacobian)
 
 
@@ -94,7 +90,7 @@ def test_a_model_that_an_estimator_brings_counts_as_a_deviation_from_how_it_bega
 
 def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_frames():
     q, recorder = path(12), Recorder()
-    y = features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))
+    y = late_features(q, np.eye(M)) + 0.01 * np.random.default_rng(3).normal(size=(len(q), M))
     states, _ = follow(recorder, q, y, filter=True, feature_noise=0.01)
     e = np.array([state.learned.pair.regression.mean[:, -1] for state in states])
     assert np.abs(e[1:]).min(axis=1).all()
@@ -105,7 +101,7 @@ def test_with_the_filter_the_estimator_gets_motions_without_the_noise_of_their_f
 def test_what_an_estimator_learned_from_false_frames_is_taken_back_with_them(model):
     """Once the next true frame is seen, it has learned from the motion over both as if they had been lost."""
     q, found = path(40), []
-    y, valid = features(q, np.eye(M)), np.full(len(q), True)
+    y, valid = late_features(q, np.eye(M)), np.full(len(q), True)
     valid[[20, 29, 30]] = False
     for false in (0.0, 0.3):
         shown = y + np.where(valid, 0.0, false)[:, None]
@@ -131,13 +127,6 @@ def path(steps, seed=1):
     return np.concatenate([np.zeros((1, N)), np.cumsum(speed * np.minimum(1.0, t / 3.0), axis=0)])
 
 
-def features(q, turn, network=NETWORK, delay=0):
-    J = network.jacobian(q)
-    steps = np.matvec(turn @ (J[1:] + J[:-1]) / 2.0, np.diff(q, axis=0))
-    y = np.concatenate([np.zeros((1, M)), np.cumsum(steps, axis=0)])
-    return np.concatenate([np.repeat(y[:1], delay, axis=0), y[: len(y) - delay]])
-
-
 def follow(estimator, q, y, knowledge=MODELLED, **aids):
     """Return the states after each period, and the stages."""
     stages = Estimation(estimator, knowledge, AidsConfig(**aids), NONE)
@@ -152,18 +141,18 @@ def follow(estimator, q, y, knowledge=MODELLED, **aids):
 @pytest.mark.parametrize("delay", ["given", "identified"])
 def test_beside_an_exact_model_the_deviation_learns_nothing(model, delay):
     q = path(60)
-    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, np.eye(M)), model=model, delay=delay)
+    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, late_features(q, np.eye(M)), model=model, delay=delay)
     for k, state in enumerate(states):
         np.testing.assert_allclose(state.learned.estimator.J, 0.0, atol=1e-12)
         np.testing.assert_allclose(state.jacobian, NETWORK.jacobian(q[k]), atol=1e-12)
-    own, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, np.eye(M)), delay=delay)
+    own, _ = follow(ProjectionEstimator(BroydenConfig()), q, late_features(q, np.eye(M)), delay=delay)
     assert np.linalg.norm(own[-1].jacobian - NETWORK.jacobian(q[-1])) > 0.05
 
 
 def test_once_a_turned_camera_is_known_the_deviation_learns_little():
     q = path(150)
     aids = {"model": "regression", "delay": "identified"}
-    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, features(q, TURN, delay=2), **aids)
+    states, _ = follow(ProjectionEstimator(BroydenConfig()), q, late_features(q, TURN, delay=2), **aids)
     J = TURN @ NETWORK.jacobian(q[-1])
     assert np.linalg.norm(states[-1].learned.estimator.J) < 0.1 * np.linalg.norm(J)
     np.testing.assert_allclose(states[-1].jacobian, J, atol=0.05)
@@ -173,7 +162,7 @@ def test_the_regression_predicts_where_no_map_explains_and_more_than_the_deviati
     """The last joint's column is wrong in the model, and the camera is turned."""
     q, rows = path(200), NETWORK.weights.copy()
     rows[-1] *= -0.5
-    y, found = features(q, TURN, dataclasses.replace(NETWORK, weights=rows)), []
+    y, found = late_features(q, TURN, network=dataclasses.replace(NETWORK, weights=rows)), []
     for estimator, model in ((ConstantEstimator(), "regression"), (ProjectionEstimator(BroydenConfig()), "nominal")):
         states, _ = follow(estimator, q, y, model=model)
         found.append(np.mean([state.learned.unexplained for state in states[100:]]))

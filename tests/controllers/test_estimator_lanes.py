@@ -1,11 +1,12 @@
 """Test of all estimators over leading axes: a lane has the same bits alone and among others, in any order."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian
+from kit.toy import KNOWLEDGE, PERIOD, M, N, assert_lanes, jacobian_network, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.methods import ESTIMATORS
@@ -64,13 +65,7 @@ def learned(estimator, lanes):
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
 def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
-    estimator, order = made(name, changes), np.array([2, 0, 1])
-    together, permuted = learned(estimator, np.arange(LANES)), learned(estimator, order)
-    for lane in range(LANES):
-        for alone, among, other in zip(learned(estimator, lane), together, permuted, strict=True):
-            for key, value in alone.items():
-                np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
-                np.testing.assert_array_equal(value, other[key][order.tolist().index(lane)], err_msg=key)
+    assert_lanes(partial(learned, made(name, changes)))
 
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
@@ -122,15 +117,8 @@ def test_probing_has_the_same_bits_alone_and_among_others():
             state, u, done = provider.step(provider.start(look) if state is None else state, look)
             q = q + u * PERIOD
             velocities.append((u, done))
-        return velocities, provider.jacobian(state)
+        return [velocities, provider.jacobian(state)]
 
-    (together, J), finished = probed(np.arange(LANES)), set()
-    for lane in range(LANES):
-        alone, J_alone = probed(lane)
-        np.testing.assert_array_equal(J_alone, J[lane])
-        for (u, done), (u_among, done_among) in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(u, u_among[lane])
-            assert done == done_among[lane]
-        finished.add(sum(not done for _, done in alone))
-    assert len(finished) > 1  # not all at the same time
-    assert max(finished) < 250
+    finished = 250 - np.sum([done for _, done in assert_lanes(probed)[0]], axis=0)
+    assert len(set(finished.tolist())) > 1  # not all at the same time
+    assert finished.max() < 250

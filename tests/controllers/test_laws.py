@@ -1,9 +1,11 @@
 """Test of all laws with the last stages: a lane has the same bits alone and among others, in any order."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, Commanding, M, N, networks
+from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, Commanding, M, N, assert_lanes, networks
 from servobench.controllers.laws.law import Estimate
 from servobench.controllers.methods import LAWS
 from servobench.plant.contract.signals import trusted_observation
@@ -18,12 +20,9 @@ SETTINGS = [
     ("mpc", {**TIGHT, "horizon_time": 0.4, "delay": 0.1, "fallback": "closed_form"}, {}),
     ("mpc", {**TIGHT, "mode": "constant", "terminal_weight": 1.0, "use_preview": False}, {"posture": True}),
     ("rbfnn", {}, {}),
-    (
-        "rbfnn",
-        {"row_space_only": False, "position": "commanded", "anti_windup": False, "preview": False},
-        {"feedforward": True},
-    ),
-]
+    ("rbfnn", {"row_space_only": False, "position": "commanded", "anti_windup": False, "preview": False},
+     {"feedforward": True}),
+]  # fmt: skip
 
 
 def closed_loop(law, aids, lanes):
@@ -48,27 +47,19 @@ def closed_loop(law, aids, lanes):
             made = Commanding(law, look, KNOWLEDGE, **aids)
         ahead = np.moveaxis(reference[k : k + PREVIEW + 1, lanes], 0, -2)
         u = made.command(Estimate(J[k, lanes]), look, np.ascontiguousarray(ahead))
-        found.append((u, {**made.diagnostics(), "saturated": made.limited}))
+        found.append({**made.diagnostics(), "u": u, "saturated": made.limited, "valid": valid[k, lanes]})
         q = q + 0.9 * u * PERIOD
         past.append(q)
-    return found, valid
+    return found
 
 
 @pytest.mark.parametrize(("name", "changes", "aids"), SETTINGS)
 def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes, aids):
     part = LAWS[name]
     law = part.make(part.config(**changes), KNOWLEDGE, *([networks()] if part.trained else []))
-    order = np.array([2, 0, 1])
-    (together, valid), (permuted, _) = closed_loop(law, aids, np.arange(LANES)), closed_loop(law, aids, order)
-    for lane in range(LANES):
-        alone, _ = closed_loop(law, aids, lane)
-        for (u, numbers), (u_among, among), (u_permuted, _) in zip(alone, together, permuted, strict=True):
-            np.testing.assert_array_equal(u, u_among[lane])
-            np.testing.assert_array_equal(u, u_permuted[order == lane][0])
-            for key, value in numbers.items():
-                np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
-    saturated = np.array([numbers["saturated"] for _, numbers in together])
-    for differs in (saturated.T, valid.T) if name != "mpc" else (valid.T,):
+    found = assert_lanes(partial(closed_loop, law, aids))
+    saturated, valid = (np.array([each[key] for each in found]).T for key in ("saturated", "valid"))
+    for differs in (saturated, valid) if name != "mpc" else (valid,):
         assert differs.any()
         assert not differs.all()
         assert (differs.any(axis=0) & ~differs.all(axis=0)).any()  # in one period in some lanes only

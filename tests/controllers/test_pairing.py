@@ -5,20 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
-from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from kit.toy import KNOWLEDGE, PERIOD, SPEC, M, N, jacobian_network, seen
+from kit.toy import KNOWLEDGE, NETWORK, PERIOD, SPEC, TURN, M, N, assert_lanes, late_features, seen
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages import pairing
 from servobench.controllers.stages.estimation import Estimation
-from servobench.plant.contract.lanes import take
 from servobench.plant.contract.signals import Observation, trusted_observation
 
-TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
-NETWORK = dataclasses.replace(jacobian_network(N, M, units=6), weights=0.3 * jacobian_network(N, M, units=6).weights)
 MAPPED = {"delay": "identified", "noise": "identified", "model": "regression"}
 
 
@@ -65,19 +61,12 @@ def path(duration, period=PERIOD, seed=1):
     return np.concatenate([np.zeros((1, N)), np.cumsum(period * speed, axis=0)])
 
 
-def features(q, turn, delay, network=NETWORK):
-    """The feature along a path, late by `delay` periods: summed in the very steps in which it is predicted."""
-    J = network.jacobian(q)
-    steps = np.matvec(turn @ (J[1:] + J[:-1]) / 2.0, np.diff(q, axis=0))
-    y = np.concatenate([np.zeros((1, M)), np.cumsum(steps, axis=0)])
-    return np.concatenate([np.repeat(y[:1], delay, axis=0), y[: len(y) - delay]])
-
-
 @pytest.mark.parametrize("delay", range(6))
 @pytest.mark.parametrize("turn", [np.eye(M), TURN], ids=["as modelled", "turned"])
 def test_delay_and_jacobian_are_found_in_noise(delay, turn):
     q = path(4.0)
-    made = Following().follow(q, features(q, turn, delay) + 2e-4 * np.random.default_rng(0).normal(size=(len(q), M)))
+    noise = 2e-4 * np.random.default_rng(0).normal(size=(len(q), M))
+    made = Following().follow(q, late_features(q, turn, delay) + noise)
     assert made.found["delay"] == pytest.approx(delay * PERIOD)
     wanted = np.arccos((np.trace(turn) - 1.0) / 2.0)
     assert made.found["map_rotation"] == pytest.approx(wanted, abs=0.05)
@@ -88,7 +77,7 @@ def test_delay_and_jacobian_are_found_in_noise(delay, turn):
 def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
     q = path(4.0, period)
     noise = 2e-4 * np.random.default_rng(0).normal(size=(len(q), M))
-    made = Following(period).follow(q, features(q, TURN, round(latency / period)) + noise)
+    made = Following(period).follow(q, late_features(q, TURN, round(latency / period)) + noise)
     assert made.found["delay"] == pytest.approx(latency, abs=1.5 * max(period, 0.25 / 24))
     assert len(made.pair.scores) <= 25
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1  # the delay may lie between two candidates
@@ -97,7 +86,7 @@ def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
 @pytest.mark.parametrize(("period", "latency"), [(0.05, 0.025), (0.05, 0.0875), (0.02, 0.05)])
 def test_a_latency_between_two_periods_is_found(period, latency):
     fine, parts = path(4.0, period / 8), 8
-    y = features(fine, TURN, round(parts * latency / period))[::parts]
+    y = late_features(fine, TURN, round(parts * latency / period))[::parts]
     made = Following(period).follow(fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape))
     assert made.found["delay"] == pytest.approx(latency, abs=1.01 * pairing.RESOLUTION)
     assert made.error(TURN @ NETWORK.jacobian(fine[-1])) < 0.1
@@ -107,14 +96,14 @@ def test_the_delay_is_found_within_a_few_motions():
     q, found = path(0.6), []
     for seed in range(20):
         noise = np.random.default_rng(seed).normal(scale=0.001, size=(len(q), M))
-        found.append(round(Following().follow(q, features(q, TURN, 2) + noise).found["delay"] / PERIOD))
+        found.append(round(Following().follow(q, late_features(q, TURN, 2) + noise).found["delay"] / PERIOD))
     assert found.count(2) >= 18
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.06, 0.1, 0.25])
 def test_a_given_delay_is_used_as_it_is(latency):
     made, q = Following(latency=latency, delay="given"), path(1.0)
-    made.follow(q, features(q, TURN, 4))
+    made.follow(q, late_features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
     exposed, before, moved, *_ = made.stages.pairing.past(made.pair, q[-1], 1)
     at = len(q) - 1 - latency / PERIOD
@@ -136,7 +125,7 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
     monkeypatch.setattr(pairing, "RESOLUTION", PERIOD)
     rng, sigma, count = np.random.default_rng(4), 0.025, 10
     q = np.concatenate([np.zeros((1, N)), np.cumsum(rng.choice([-0.03, 0.03], (count, N)), axis=0)])
-    y = features(q, np.eye(M), 1) + sigma * rng.normal(size=(count + 1, M))
+    y = late_features(q, np.eye(M), 1) + sigma * rng.normal(size=(count + 1, M))
     made = Following(noise="given", feature_noise=sigma, longest_delay=0.2, delay_margin=0.0).follow(q, y)
     J, dq, wanted = NETWORK.jacobian(q), np.diff(q, axis=0), []
     x = np.matvec((J[1:] + J[:-1]) / 2.0, dq)
@@ -158,7 +147,7 @@ def test_the_scores_of_the_delays_are_their_likelihoods(monkeypatch):
 @pytest.mark.parametrize("sigma", [3e-4, 0.002, 0.02])
 def test_the_noise_is_found(sigma):
     q = 0.1 * path(15.0)  # so slow that the error that a model may have does not hide the noise
-    y = features(q, TURN, 1) + sigma * np.random.default_rng(4).normal(size=(len(q), M))
+    y = late_features(q, TURN, 1) + sigma * np.random.default_rng(4).normal(size=(len(q), M))
     assert 0.7 < Following().follow(q, y).found["noise_level"] / sigma < 1.4
 
 
@@ -181,7 +170,7 @@ def test_on_a_steady_circle_the_delay_is_kept_as_its_beginning_showed_it(memory,
 
 def test_lost_frames_do_not_mislead_jacobian_and_delay():
     q, rng = path(6.0), np.random.default_rng(3)
-    made = Following().follow(q, features(q, TURN, 2), rng.random(len(q)) < 0.5)
+    made = Following().follow(q, late_features(q, TURN, 2), rng.random(len(q)) < 0.5)
     assert made.found["delay"] == pytest.approx(2 * PERIOD, abs=1.01 * pairing.RESOLUTION)
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
 
@@ -189,7 +178,7 @@ def test_lost_frames_do_not_mislead_jacobian_and_delay():
 @pytest.mark.parametrize("false", [[12], [12, 13], [12, 17, 18, 19, 26]])
 def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
     q = path(1.6)
-    y, valid = features(q, np.eye(M), 0), np.full(len(q), True)
+    y, valid = late_features(q, np.eye(M), 0), np.full(len(q), True)
     y += 5e-4 * np.random.default_rng(5).normal(size=y.shape)
     valid[false] = False
     lost = Following(noise="given", feature_noise=5e-4).follow(q, y, valid)
@@ -202,7 +191,7 @@ def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
 
 def test_a_frame_that_another_delay_explains_is_not_taken_for_a_false_one():
     q = path(1.6)
-    y = features(q, np.eye(M), 0)
+    y = late_features(q, np.eye(M), 0)
     made = Following(noise="given", feature_noise=5e-4).follow(q[:24], y[:24])
     before = made.pair.anchor.miss
     made.see(q[24], y[21])  # it comes three periods late
@@ -215,7 +204,7 @@ def test_a_frame_that_another_delay_explains_is_not_taken_for_a_false_one():
 @pytest.mark.parametrize("period", [0.05, 0.008])
 def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(period):
     q = path(5.0, period)
-    y, valid = features(q, TURN, 0), np.full(len(q), True)
+    y, valid = late_features(q, TURN, 0), np.full(len(q), True)
     lost = slice(round(2.0 / period), round(4.0 / period))
     valid[lost] = False
     made = Following(period).follow(q[: lost.stop], y[: lost.stop], valid)
@@ -231,7 +220,7 @@ def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(p
 
 def test_a_jump_of_the_feature_is_no_motion_and_after_three_frames_any_map_is_possible_again():
     q = path(1.6)
-    made, y, moves = Following(), features(q, np.eye(M), 0), []
+    made, y, moves = Following(), late_features(q, np.eye(M), 0), []
     made.follow(q[:30], y[:30])
     before, known = made.state.jacobian, made.pair.bank[:, M:-1, :-1]
     for k in range(30, 33):
@@ -248,7 +237,7 @@ def test_a_camera_turned_without_a_jump_is_known_by_motions_that_it_cannot_expla
     """The camera turns about the ball itself: only motions show it."""
     q = path(4.5)
     noise = np.random.default_rng(2).normal(scale=1e-4, size=(len(q), M))
-    before, after = features(q, np.eye(M), 0), features(q, TURN, 0)
+    before, after = late_features(q, np.eye(M), 0), late_features(q, TURN, 0)
     y = np.concatenate([before[:61], after[61:] - after[60] + before[60]]) + noise
     made = Following(delay="given").follow(q[:61], y[:61])
     made.follow(q[61:72], y[61:72])
@@ -258,7 +247,7 @@ def test_a_camera_turned_without_a_jump_is_known_by_motions_that_it_cannot_expla
 
 def test_the_delay_is_found_where_the_jacobian_is_only_the_nominal_one():
     q = path(2.0)
-    made = Following(model="nominal").follow(q, features(q, np.eye(M), 3))
+    made = Following(model="nominal").follow(q, late_features(q, np.eye(M), 3))
     assert made.found["delay"] == pytest.approx(3 * PERIOD)
     np.testing.assert_array_equal(made.state.jacobian, NETWORK.jacobian(q[-1]))
 
@@ -268,7 +257,7 @@ def test_a_model_that_is_wrong_by_more_than_a_map_hides_neither_the_delay_nor_th
     rows = NETWORK.weights.copy()
     rows[-2:] *= -0.5
     q, levels = path(4.0, seed=2), []
-    y = features(q, TURN, 2, dataclasses.replace(NETWORK, weights=rows))
+    y = late_features(q, TURN, 2, dataclasses.replace(NETWORK, weights=rows))
     y = y + 2e-4 * np.random.default_rng(2).normal(size=y.shape)
     for deviation, walk in ((pairing.REST_DEVIATION, pairing.REST_WALK), (1e-9, 0.0)):
         monkeypatch.setattr(pairing, "REST_DEVIATION", deviation)
@@ -283,7 +272,7 @@ def test_a_feature_that_is_not_seen_teaches_nothing_whatever_its_last_frame_was(
     """The second feature is lost for a while, after a frame that was an outlier or not: the model hardly differs."""
     q, found = path(3.0), []
     for outlier in (0.0, 0.3):
-        y, made = features(q, TURN, 0), Following(delay="given", noise="given", feature_noise=3e-4)
+        y, made = late_features(q, TURN, 0), Following(delay="given", noise="given", feature_noise=3e-4)
         y[30, 1] += outlier
         for k in range(len(q)):
             made.see(q[k], y[k], np.array([True, not 30 < k < 40, True]))
@@ -307,7 +296,8 @@ def test_a_lane_has_the_bits_of_a_single_run():
     stage, rng, J = pairing.Pairing(AidsConfig(**MAPPED), KNOWLEDGE, 0.0), np.random.default_rng(3), NETWORK.jacobian
     q = np.stack([path(2.0, seed=seed)[:40] for seed in range(3)], axis=1)
     q[20:, 2] = q[20, 2]
-    y = np.stack([features(q[:, lane], TURN, lane) for lane in range(3)], axis=1) + 1e-3 * rng.normal(size=(40, 3, M))
+    y = np.stack([late_features(q[:, lane], TURN, lane) for lane in range(3)], axis=1)
+    y += 1e-3 * rng.normal(size=y.shape)
     y[25:, 0] += 0.5
     valid = np.full((40, 3, M), True)
     valid[10:15, 1, 2] = False
@@ -321,15 +311,8 @@ def test_a_lane_has_the_bits_of_a_single_run():
             state, paired = stage.learn(state, y[k, lanes] - y[k - 1, lanes], duration, valid[k, lanes])
             found.append(paired)
             state = stage.interrupt(state) if k == 30 else state
-        return state, found, stage.diagnostics(state), stage.past(state, q[-1, lanes], 1)
+        return [state, found, stage.diagnostics(state), stage.past(state, q[-1, lanes], 1)]
 
-    order = np.array([2, 0, 1])
-    together, permuted = run(np.arange(3)), run(order)
-    assert together[2]["delay"] == pytest.approx(PERIOD * np.arange(3), abs=1.01 * pairing.RESOLUTION)
-    assert together[2]["camera_moves"][0] == 1
-    for lane in range(3):
-        alone = run(lane)
-        np.testing.assert_equal(take(together[::3], lane), alone[::3])
-        np.testing.assert_equal(take(permuted[::3], order.tolist().index(lane)), alone[::3])
-        for key, value in alone[2].items():
-            np.testing.assert_array_equal(together[2][key][lane], value, err_msg=key)
+    *_, found, _ = assert_lanes(run)
+    assert found["delay"] == pytest.approx(PERIOD * np.arange(3), abs=1.01 * pairing.RESOLUTION)
+    assert found["camera_moves"][0] == 1

@@ -33,13 +33,18 @@ def frames(count, share, size=0.2, frames_each=1, seed=0):
     return J, dq, y
 
 
+def learned(estimator, J, dq, y):
+    """Return an estimator that has learned from all frames, and has begun with J."""
+    run = Learning(estimator, J)
+    for k in range(1, len(y)):
+        run.update(motion(dq[k], y[k] - y[k - 1]))
+    return run
+
+
 def error_after(estimator, share, **values):
     """Return ‖Ĵ − J‖/‖J‖ after 600 frames, begun from a Jacobian that is wrong by a tenth."""
     J, dq, y = frames(600, share, **values)
-    run = Learning(estimator, 1.1 * J)
-    for k in range(1, len(y)):
-        run.update(motion(dq[k], y[k] - y[k - 1]))
-    return np.linalg.norm(run.jacobian() - J) / np.linalg.norm(J)
+    return np.linalg.norm(learned(estimator, 1.1 * J, dq, y).jacobian() - J) / np.linalg.norm(J)
 
 
 def test_a_filter_without_weights_is_the_kalman_filter_of_feature_and_jacobian():
@@ -92,9 +97,7 @@ def test_it_holds_at_40_percent_outlier_frames_where_others_do_not(frames_each):
 def test_an_outlier_in_the_first_frame_is_a_delay_only():
     J, dq, y = frames(400, 0.0)
     y[0] += 0.2
-    run = Learning(RobustEstimator(RobustConfig(walk=0.01)), 1.1 * J)
-    for k in range(1, len(y)):
-        run.update(motion(dq[k], y[k] - y[k - 1]))
+    run = learned(RobustEstimator(RobustConfig(walk=0.01)), 1.1 * J, dq, y)
     assert np.linalg.norm(run.jacobian() - J) < 0.03 * np.linalg.norm(J)
     assert np.abs(run.state.deviation).max() < 0.01
 
@@ -108,9 +111,7 @@ def test_a_rejected_frame_counts_by_its_time():
 def test_the_scale_follows_noise_that_is_larger_than_configured():
     J, dq, y = frames(600, 0.0)
     y += 0.01 * np.random.default_rng(7).normal(size=y.shape)
-    run = Learning(RobustEstimator(RobustConfig(walk=0.01, motion_error=0.0)), 1.1 * J)
-    for k in range(1, len(y)):
-        run.update(motion(dq[k], y[k] - y[k - 1]))
+    run = learned(RobustEstimator(RobustConfig(walk=0.01, motion_error=0.0)), 1.1 * J, dq, y)
     assert 6.0 < run.diagnostics()["noise_scale"] < 16.0
     assert run.diagnostics()["rejected_share"] < 0.1
 

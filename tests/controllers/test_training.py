@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kit.toy import PERIOD, plant_spec
+from kit.toy import PERIOD, planar_jacobian, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.mpc.mpc import MpcConfig
 from servobench.controllers.methods import METHODS
@@ -31,14 +31,6 @@ SPEC = plant_spec(N, M)
 JACOBIAN = JacobianTraining(centres=40, samples=400)
 CONTROLLER = ControllerTraining(hidden=12, samples=500)
 CONFIG = TrainingConfig((0.5,) * N, (1.5,) * N, jacobian=JACOBIAN, controller=CONTROLLER)
-
-
-def planar_jacobian(q):
-    """The tip of a planar arm with three links of 0.5, 0.4 and 0.3 m."""
-    angle = np.cumsum(q, axis=-1)
-    x, y = np.array([0.5, 0.4, 0.3]) * np.sin(angle), np.array([0.5, 0.4, 0.3]) * np.cos(angle)
-    columns = [np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], axis=-1) for i in range(N)]
-    return np.stack(columns, axis=-1)
 
 
 def longer_jacobian(q):
@@ -238,10 +230,8 @@ def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
     with pytest.raises(ValueError, match="is not a network file of servobench"):
         load_networks(path)
     for name, value in (
-        ("controller_weights", np.zeros((2, 2))),
-        ("history", np.array([1])),
-        ("sizes", np.array([6, 3])),
-    ):
+        ("controller_weights", np.zeros((2, 2))), ("history", np.array([1])), ("sizes", np.array([6, 3])),
+    ):  # fmt: skip
         np.savez(path, **{**arrays, name: value})
         with pytest.raises(ValueError, match="is corrupt: "):
             load_networks(path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.toy import TRAINING, plant_spec
+from kit.toy import TRAINING, planar_jacobian, plant_spec
 from servobench.controllers.networks.fit import train
 from servobench.harness.run import knowledge as network_cache
 from servobench.harness.run.knowledge import NETWORKS, NetworkSource, keep_networks
@@ -11,14 +11,6 @@ from servobench.plant.contract import cache
 from servobench.plant.contract.cache import cache_folder
 
 SPEC = plant_spec(2, 2)
-
-
-def planar_jacobian(q):
-    """The tip of a planar arm with two links of 0.5 and 0.4 m."""
-    angle = np.cumsum(q, axis=-1)
-    x, y = np.array([0.5, 0.4]) * np.sin(angle), np.array([0.5, 0.4]) * np.cos(angle)
-    columns = [np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], axis=-1) for i in range(2)]
-    return np.stack(columns, axis=-1)
 
 
 @pytest.fixture

@@ -1,10 +1,12 @@
 """A made-up arm whose Jacobian is constant, so that whatever a controller of it promises can be checked exactly."""
 
+import dataclasses
 from collections import deque
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
@@ -13,6 +15,7 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features
 from servobench.controllers.stages.finish import Finish
+from servobench.plant.contract.lanes import take
 from servobench.plant.contract.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
@@ -91,6 +94,47 @@ def jacobian_network(n=3, m=2, units=4, seed=0):
     rng = np.random.default_rng(seed)
     shapes = rng.normal(size=(n, units, n)), rng.uniform(1.0, 2.0, (n, units))
     return JacobianNetwork(*shapes, rng.normal(size=(n, m, units)))
+
+
+def planar_jacobian(q):
+    """Return that of the tip of a planar arm with two or three links, of 0.5, 0.4 and 0.3 m."""
+    lengths, angle = np.array([0.5, 0.4, 0.3])[: q.shape[-1]], np.cumsum(q, axis=-1)
+    x, y = lengths * np.sin(angle), lengths * np.cos(angle)
+    return np.stack([np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], -1) for i in range(len(lengths))], -1)
+
+
+TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
+NETWORK = jacobian_network(N, M, units=6)
+NETWORK = dataclasses.replace(NETWORK, weights=0.3 * NETWORK.weights)
+
+
+def late_features(q, turn, delay=0, network=NETWORK):
+    """Return features along a path, late by `delay` periods: summed in the very steps in which they are predicted."""
+    J = network.jacobian(q)
+    steps = np.matvec(turn @ (J[1:] + J[:-1]) / 2.0, np.diff(q, axis=0))
+    y = np.concatenate([np.zeros((1, M)), np.cumsum(steps, axis=0)])
+    return np.concatenate([np.repeat(y[:1], delay, axis=0), y[: len(y) - delay]])
+
+
+def assert_lanes(run):
+    """Check that each of three lanes has the same bits alone and among others, in any order; return all together."""
+    order = np.array([2, 0, 1])
+    together, permuted = run(np.arange(3)), run(order)
+    for place, lane in enumerate(order):
+        alone = run(lane)
+        _assert_lane(together, lane, alone)
+        _assert_lane(permuted, place, alone)
+    return together
+
+
+def _assert_lane(results, lane, alone):
+    if isinstance(alone, dict):  # lanes may have more to tell together
+        results, alone = [results[key] for key in alone], [*alone.values()]
+    if isinstance(alone, list):
+        for one, own in zip(results, alone, strict=True):
+            _assert_lane(one, lane, own)
+    else:
+        np.testing.assert_equal(take(results, lane), alone)
 
 
 A = 0.4 * np.random.default_rng(11).normal(size=(M, N))  # m/rad
