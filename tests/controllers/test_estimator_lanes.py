@@ -1,7 +1,6 @@
-"""Test of all estimators over leading axes: a lane has the same bits alone and among others, in any order."""
+"""Tests of all estimators, and of probing, over leading axes; `test_chain_lanes` has them in their chains."""
 
 import dataclasses
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,10 +10,9 @@ from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
 from servobench.controllers.methods import ESTIMATORS
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import trusted_observation
 
-LANES, PERIODS = 3, 70
+LANES = 3
 NETWORK = jacobian_network(N, M, units=5)
 KNOWING = dataclasses.replace(KNOWLEDGE, true_jacobian=NETWORK.jacobian)
 SETTINGS = [
@@ -28,44 +26,6 @@ SETTINGS = [
 def made(name, changes):
     part = ESTIMATORS[name]
     return part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
-
-
-def seen():
-    """Return joint positions, features and where they are valid, each with axes of periods and lanes.
-
-    One lane rests for a while, one loses 20 frames at a stretch, one sees a camera that is moved.
-    """
-    rng, t = np.random.default_rng(5), np.arange(PERIODS)[:, None, None]
-    steps = 0.05 * np.sin(2 * np.pi * t / rng.uniform(10.0, 30.0, (LANES, N)) + rng.uniform(0.0, 6.0, (LANES, N)))
-    steps[10:16, 0] = 0.0
-    q = np.cumsum(steps, axis=0)
-    turns = np.stack([np.eye(M), -np.eye(M), np.eye(M)[[1, 2, 0]]])
-    moved = np.concatenate([np.zeros((1, LANES, M)), np.matvec(turns @ NETWORK.jacobian(q[:-1]), np.diff(q, axis=0))])
-    y = np.cumsum(moved, axis=0) + 0.001 * rng.normal(size=moved.shape)
-    y[40:, 2] += 3.0
-    valid = rng.random((PERIODS, LANES)) < 0.85
-    valid[20:40, 1] = False
-    valid[0] = True
-    return q, y, valid
-
-
-def learned(estimator, lanes):
-    """Return Ĵ and diagnostics of every period; from the 30th on the noise is known."""
-    q, y, valid = (each[:, lanes] for each in seen())
-    state = estimator.start(NETWORK.jacobian(q[0]))
-    last, found = (q[0], y[0], np.zeros(np.shape(valid[0]))), []
-    for k in range(1, PERIODS):
-        noise = 0.001 + 1e-5 * np.asarray(lanes) * k if k > 30 else None
-        motion = Motion(last[0], q[k] - last[0], y[k] - last[1], 0.1 - y[k], (k - last[2]) * PERIOD, noise)
-        state = branch(valid[k], estimator.update, state, motion)
-        last = branch(valid[k], lambda _, now: now, last, (q[k], y[k], np.full(np.shape(valid[k]), float(k))))
-        found.append(dict(estimator.diagnostics(state)) | {"J": estimator.jacobian(state, q[k])})
-    return found
-
-
-@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
-def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
-    assert_lanes(partial(learned, made(name, changes)))
 
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")

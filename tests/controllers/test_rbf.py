@@ -166,8 +166,11 @@ def test_the_first_lyapunov_update_equals_the_one_computed_by_hand():
     assert estimator.diagnostics()["rate_error"] == pytest.approx(6.0)
 
 
-def lyapunov_run(true, estimator, config, gain=4.0, dt=1e-3, steps=1500, sign=1.0):
+def lyapunov_run(gain=4.0, dt=1e-3, steps=1500, sign=1.0):
     """Return V and its predicted rate along u = K_p Ĵ⁺ e on the plant ẏ = J(q) q̇ whose J the network can represent."""
+    true, config, rng = network(seed=3), RbfLyapunovConfig(n2=0.5, n3=0.5), np.random.default_rng(4)
+    weights = true.weights + 0.2 * rng.normal(size=true.weights.shape)
+    estimator = started_lyapunov(config, JacobianNetwork(true.centres, true.widths, weights))
     q, e, V, rate = np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.2]), [], []
     for _ in range(steps):
         J_hat, J = estimator.jacobian(q), true.jacobian(q)
@@ -181,22 +184,14 @@ def lyapunov_run(true, estimator, config, gain=4.0, dt=1e-3, steps=1500, sign=1.
 
 
 def test_v_decreases_along_a_run_and_at_the_predicted_rate():
-    true, config, dt = network(seed=3), RbfLyapunovConfig(n2=0.5, n3=0.5), 1e-3
-    start = JacobianNetwork(
-        true.centres, true.widths, true.weights + 0.2 * np.random.default_rng(4).normal(size=true.weights.shape)
-    )
-    V, rate, e = lyapunov_run(true, started_lyapunov(config, start), config, dt=dt)
+    V, rate, e = lyapunov_run()
     assert (np.diff(V) < 0.0).all()
-    np.testing.assert_allclose(np.diff(V)[:50] / dt, rate[:50], rtol=0.01)
+    np.testing.assert_allclose(np.diff(V)[:50] / 1e-3, rate[:50], rtol=0.01)
     assert np.linalg.norm(e) < 0.05 * np.linalg.norm([0.3, -0.2])
 
 
 def test_with_the_paper_s_plus_sign_v_would_not_fall_at_that_rate():
-    true, config = network(seed=3), RbfLyapunovConfig(n2=0.5, n3=0.5)
-    start = JacobianNetwork(
-        true.centres, true.widths, true.weights + 0.2 * np.random.default_rng(4).normal(size=true.weights.shape)
-    )
-    V, rate, _ = lyapunov_run(true, started_lyapunov(config, start), config, steps=50, sign=-1.0)
+    V, rate, _ = lyapunov_run(steps=50, sign=-1.0)
     assert np.max(np.abs(np.diff(V) / 1e-3 - rate[:-1]) / np.abs(rate[:-1])) > 0.05
 
 
