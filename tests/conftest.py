@@ -89,6 +89,35 @@ def no_figures(monkeypatch):
 
 
 @pytest.fixture
+def output_of(monkeypatch, capsys):
+    """A function that carries out a command, which ends with an exit code, and returns what it printed."""
+    from kit.command import servobench
+
+    def call(*words: object, code: int = 0) -> str:
+        capsys.readouterr()
+        assert servobench(monkeypatch, *map(str, words)) == code
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def refusal_of(monkeypatch, capsys):
+    """A function that calls a command, which refuses with exit code 2 and in one line, and returns this line."""
+    from kit.command import servobench
+
+    def call(*words: object) -> str:
+        capsys.readouterr()
+        assert servobench(monkeypatch, *map(str, words)) == 2
+        line = capsys.readouterr().err
+        assert line.startswith("servobench: ")
+        assert line.count("\n") == 1
+        return line
+
+    return call
+
+
+@pytest.fixture
 def own_folder(tmp_path, monkeypatch):
     """Give a test a folder, a path of imports and offers of its own."""
     from servobench.harness.config.registry import offering

@@ -3,14 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from kit.command import servobench
 
-
-def test_loops_are_analysed_side_by_side(monkeypatch, capsys, tmp_path):
+def test_loops_are_analysed_side_by_side(output_of, tmp_path):
     arguments = ["pid+true", "mfac+ukf", "--out", str(tmp_path), "--set", "mfac+ukf.law.gain=60.0"]
-    assert servobench(monkeypatch, "analyse", *arguments) == 0
-    printed = capsys.readouterr().out
-    assert "true Jacobian" in printed
+    assert "true Jacobian" in output_of("analyse", *arguments)
     table = pd.read_csv(tmp_path / "analyse.csv").set_index("controller")
     assert table["stable"].tolist() == [True, False]
     assert np.isnan(table.loc["mfac+ukf", "gain_margin"])
@@ -23,14 +19,13 @@ def test_loops_are_analysed_side_by_side(monkeypatch, capsys, tmp_path):
     assert figures == ["loops.pdf", "loops.png", "stability_map.pdf", "stability_map.png"]
 
 
-def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(monkeypatch, capsys, tmp_path):
+def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(output_of, monkeypatch, tmp_path):
     monkeypatch.setattr("servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder])
     margins = []
     for robot, how in (("ur5", ("--jacobian", "nominal")), ("panda", ("--identify",))):
         identified = "--identify" in how
         asked = ["pid+constant", "--mismatch", "moderate", "--robot", robot, "--out", str(tmp_path / robot), *how]
-        assert servobench(monkeypatch, "analyse", *asked) == 0
-        assert ("identified in small motions" in capsys.readouterr().out) == identified
+        assert ("identified in small motions" in output_of("analyse", *asked)) == identified
         table = pd.read_csv(tmp_path / robot / "analyse.csv")
         assert table["model"].tolist() == ["identified" if identified else "linearised"]
         margins.append(table["delay_margin_s"].iloc[0])

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from kit.command import no_file_above, servobench
+from kit.command import no_file_above
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.studies import claims, reproduction
 from servobench.harness.studies.claims import (
@@ -234,12 +234,11 @@ def test_the_methods_as_published_are_answered_for_under_their_plain_names():
     assert names == {f"{name}:published" for name in METHODS}
 
 
-def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(monkeypatch, capsys, tmp_path):
+def test_all_robots_of_the_claims_have_the_mismatch_that_is_asked_for(refusal_of, tmp_path):
     made = studies(["kinematic"], 6, "best equipped", "lab")
     assert all("-lab-" in cell.request.run_id for study in made.values() for cell in study.cells)
     wrong = ("claims", "--plants", "kinematic", "--seeds", "6", "--mismatch", "labs", "--out", str(tmp_path / "out"))
-    assert servobench(monkeypatch, *wrong) == 2
-    assert "lab" in capsys.readouterr().err
+    assert "lab" in refusal_of(*wrong)
     assert not (tmp_path / "out").exists()
 
 
@@ -259,18 +258,15 @@ def test_no_study_uses_a_seed_that_methods_were_tuned_on():
         assert min(seeds) == FIRST_SEED
 
 
-def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch, tmp_path, capsys):
+def test_the_command_answers_from_real_runs_and_says_the_same_again(output_of, monkeypatch, tmp_path):
     monkeypatch.setattr(claims, "TIMED_ROBOTS", 1)
     short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1", "--division", "equipped")
-    assert servobench(monkeypatch, *short, "--out", str(tmp_path / "first")) == 0
-    shown = capsys.readouterr().out
+    shown = output_of(*short, "--out", tmp_path / "first")
     assert "1: converges faster than the other three on kinematic, best equipped" in shown
     monkeypatch.setattr(reproduction, "draw_answers", lambda *_: [])
     wanted = tmp_path / "wanted.csv"
     wanted.write_text((tmp_path / "first" / "answers.csv").read_text())
     again = (*short, "--out", str(tmp_path / "first"), "--resume", "--check", str(wanted))
-    assert servobench(monkeypatch, *again) == 0
-    assert "the same answers as in" in capsys.readouterr().out
+    assert "the same answers as in" in output_of(*again)
     wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
-    assert servobench(monkeypatch, *again) == 1
-    assert "claim 1 on kinematic, best equipped: now" in capsys.readouterr().out
+    assert "claim 1 on kinematic, best equipped: now" in output_of(*again, code=1)

@@ -40,16 +40,9 @@ ONLY_READ = {
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
 OWN = (
-    "my_ur10e.yaml",
-    "my_world.toml",
-    "my_arm.urdf",
-    "mine.toml",
-    "twin.toml",
-    "crane.toml",
-    "planar",
-    "nominal_rate",
+    "my_ur10e.yaml", "my_world.toml", "my_arm.urdf", "mine.toml", "twin.toml", "crane.toml", "planar", "nominal_rate",
     "learned",
-)  # yours
+)  # yours  # fmt: skip
 
 
 def shown_lines():
@@ -110,9 +103,8 @@ def test_every_batch_that_a_page_shows_can_begin(monkeypatch, tmp_path, words):
 @pytest.mark.parametrize(
     "words", [line for line in LINES if line.values[0][0] in QUICK and not any(own in line.id for own in OWN)]
 )
-def test_every_quick_line_does_what_it_says(monkeypatch, capsys, tmp_path, words):
+def test_every_quick_line_does_what_it_says(output_of, monkeypatch, tmp_path, words):
     monkeypatch.chdir(tmp_path)
     if words[0] == "check":
         write(tmp_path, CONFIGURED, "my_law.py")
-    assert servobench(monkeypatch, *words) == 0
-    assert capsys.readouterr().out.strip()
+    assert output_of(*words).strip()

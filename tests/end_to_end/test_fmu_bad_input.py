@@ -43,15 +43,13 @@ ARCHIVES = {
     "no such file": (lambda path: None, "crane.fmu does not exist"),
     "a folder": (lambda path: path.mkdir(), " is a directory"),
     "not a zip": (lambda path: path.write_text("hello"), "crane.fmu is not a zip archive"),
-    "climbs": (
-        lambda path: write(path, {"modelDescription.xml": "<x/>", "../../evil.txt": "evil"}),
-        "holds '../../evil.txt', which would climb out",
-    ),
+    "climbs": (lambda path: write(path, {"modelDescription.xml": "<x/>", "../../evil.txt": "evil"}),
+        "holds '../../evil.txt', which would climb out"),
     "no description": (lambda path: write(path, {"readme": "hello"}), "holds no modelDescription.xml"),
     "broken XML": (lambda path: build_crane(path, 2, description="<fmiModelDescription"), "a broken modelDescription"),
     "not FMI": (lambda path: build_crane(path, 2, description="<html/>"), "crane.fmu is of FMI none"),
     "FMI 1": (lambda path: build_crane(path, 2, description=FMI1), "crane.fmu is of FMI 1.0; wanted FMI 2"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", ARCHIVES)
@@ -70,18 +68,16 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     assert list(tmp_path.rglob("evil.txt")) == []
 
 
-def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(monkeypatch, tmp_path, capsys):
+def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, monkeypatch, tmp_path):
     path = tmp_path / "crane.fmu"
     build_crane(path, 2)
     monkeypatch.setattr("servobench.fmus.inspection.validate_by_fmpy", lambda _: [])  # the crane has no ModelStructure
-    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 0
-    assert "no reference run inside; it was loaded and made ready for a run\n" in capsys.readouterr().out
+    assert "no reference run inside; it was loaded and made ready for a run\n" in output_of("fmu", "validate", path)
     with zipfile.ZipFile(path) as archive:
         contents = {name: archive.read(name) for name in archive.namelist() if "." in name}
     path.unlink()
     write(path, {name: b"text" if name.startswith("binaries") else each for name, each in contents.items()})
-    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 1
-    output = capsys.readouterr().out
+    output = output_of("fmu", "validate", path, code=1)
     assert "problem: it cannot be made ready for a run: the library in crane.fmu cannot be loaded" in output
     assert "it was loaded" not in output
 
@@ -92,15 +88,11 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(monkeypatch, 
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
         (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
-        (
-            3,
-            {"description": describe_with(3, 'start="2"', 'start="3"')},
-            "",
-            "reading wheel[1], wheel[2], wheel[3], … returned",
-        ),
+        (3, {"description": describe_with(3, 'start="2"', 'start="3"')}, "",
+         "reading wheel[1], wheel[2], wheel[3], … returned"),
         (3, {"description": describe_with(3, 'start="2"', 'start="two"')}, "", "a broken modelDescription.xml: "),
     ],
-)
+)  # fmt: skip
 def test_an_fmu_that_does_not_fit_is_one_line(
     version, arguments, more, message, monkeypatch, tmp_path, temporary, capsys
 ):

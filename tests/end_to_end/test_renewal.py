@@ -1,6 +1,5 @@
 """`make results`: studies carried out, gone on with, tried with few robots, stored and compared with what is stored."""
 
-import subprocess
 import sys
 from dataclasses import replace
 from itertools import product
@@ -14,9 +13,10 @@ from PIL import Image
 import generated_tables
 import renewal
 import stored_tables
-from kit.command import servobench
+from kit.command import carried_out
 from kit.documents import ROOT
 from kit.documents import tables as page_tables
+from kit.own import write
 from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
 from page_studies.pictures import README
 from page_studies.study import ENGINES, Study, nothing, sweep
@@ -64,8 +64,7 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     assert stored.stamp["study"] == "toy"
     assert stored.stamp["command"].startswith("servobench sweep --plants kinematic --controllers constant")
     assert len(stored.stamp["commit"]) >= 40
-    page = toy / "docs" / "page.md"
-    page.write_text("<!-- table: counts -->\nold\n<!-- end -->\n")
+    page = write(toy / "docs", "<!-- table: counts -->\nold\n<!-- end -->\n", "page.md")
     shown = generated_tables.renewed(page)
     assert "| method | runs |\n| --- | --- |\n| constant | 3 |" in shown
     assert f"commit {stored.stamp['commit'][:12]}, version {stored.stamp['version']}" in shown
@@ -196,13 +195,8 @@ def lay_out_suite(folder):
     """Write the tables of a suite of one challenge with all methods that studies compare."""
     folder.mkdir()
     own = {
-        "challenge": "severe",
-        "grade": "I",
-        "measure": "settling",
-        "reference": 0.7,
-        "score": 0.5,
-        "good.value": 99.0,
-    }
+        "challenge": "severe", "grade": "I", "measure": "settling", "reference": 0.7, "score": 0.5, "good.value": 99.0,
+    }  # fmt: skip
     methods = dict.fromkeys((*worlds.RENDERED, *worlds.FROZEN))
     pd.DataFrame([{**own, "controller": name} for name in methods]).to_csv(folder / "methods.csv")
     rank = {"rank": 1, "score.value": 0.5, "score.low": 0.4, "score.high": 0.6, "lost, %": 1.0, "within 2×": 0.5}
@@ -240,7 +234,7 @@ def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {"bench.png", "errors.png", "paths.png", "circle.png"}
 
 
-def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
+def test_the_command_draws_the_map(output_of, monkeypatch, tmp_path):
     lines = replace(robustness.LINES[4], places=robustness.LINES[4].places[:2]), robustness.LINES[-1]
     monkeypatch.setattr(robustness, "LINES", lines)
     monkeypatch.setattr(robustness, "KNOWN_LINES", {line.axis: line for line in lines})
@@ -249,8 +243,7 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
         "robustness", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1",
         "--set", "random.duration=1", "--out", str(out),
     )  # fmt: skip
-    assert servobench(monkeypatch, *arguments) == 0
-    assert "the map is in" in capsys.readouterr().out
+    assert "the map is in" in output_of(*arguments)
     assert len(results.load_runs(out)) == 7
     assert {path.name for path in (out / "figures").iterdir()} == {
         "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
@@ -310,14 +303,13 @@ def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
 
 
 def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
-    page = toy / "page.md"
-    page.write_text("<!-- table: nothing -->\n\nas it was\n\n<!-- end -->\n")
+    page = write(toy, "<!-- table: nothing -->\n\nas it was\n\n<!-- end -->\n", "page.md")
     assert generated_tables.renewed(page) == page.read_text()
 
 
 def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
     command = [sys.executable, "benchmarks/page.py", "--quick", "--out", tmp_path, "--only", "limits", "shares"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = carried_out(*command, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "performance.md").read_text(encoding="utf-8")
     limits, shares = (rows for _, _, rows in page_tables(page))

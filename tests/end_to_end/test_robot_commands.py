@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kit.command import servobench
+from kit.own import write
 from kit.plants import NEEDS_BULLET
 from kit.robots import FOUR_JOINTS, calibration_text
 from servobench.fmus.inspection import read_information, validate_fmu
@@ -18,32 +19,28 @@ SHORT = Settings({"exp2": {"duration": 3.0}})
 
 @pytest.fixture
 def ur10e(tmp_path):
-    path = tmp_path / "ur10e.yaml"
-    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
+    path = write(tmp_path, calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1), "ur10e.yaml")
     return str(path)
 
 
 @pytest.fixture
 def four(tmp_path):
-    path = tmp_path / "four.toml"
-    path.write_text(FOUR_JOINTS)
+    path = write(tmp_path, FOUR_JOINTS, "four.toml")
     return str(path)
 
 
-def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(monkeypatch, capsys, tmp_path):
+def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(output_of, monkeypatch, capsys, tmp_path):
     path = tmp_path / "panda.fmu"
     arguments = "--robot", "panda", "--mismatch", "moderate", "--seed", "3", "-o", str(path)
     assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
     found = validate_fmu(path)
     assert (found.problems, found.deviation < 1e-9) == ((), True)
     capsys.readouterr()
-    assert servobench(monkeypatch, "fmu", "info", str(path)) == 0
-    shown = capsys.readouterr().out
+    shown = output_of("fmu", "info", path)
     assert "Panda with mismatched kinematics" in shown
     assert "capabilities in co-simulation: canNotUseMemoryManagementFunctions, canGetAndSet" in " ".join(shown.split())
     assert "joint_offset[7]" in shown
-    assert servobench(monkeypatch, "fmu", "validate", str(path)) == 0
-    assert "no problem found" in capsys.readouterr().out
+    assert "no problem found" in output_of("fmu", "validate", path)
 
 
 def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(monkeypatch, tmp_path):

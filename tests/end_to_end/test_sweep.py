@@ -77,16 +77,15 @@ def test_parts_are_merged_into_the_table_of_an_undivided_sweep(count, undisturbe
 
 
 def test_runs_of_a_part_that_is_missing_are_carried_out_in_the_merged_folder(
-    undisturbed, tmp_path, monkeypatch, capsys
+    output_of, undisturbed, tmp_path, monkeypatch
 ):
     folders, merged = parts(tmp_path, monkeypatch, 3, (1, 3)), str(tmp_path / "merged")
-    assert servobench(monkeypatch, "merge", *folders, "--out", merged) == 0
-    assert "32 of 48 runs are there: --resume carries out the others" in capsys.readouterr().out
+    assert "32 of 48 runs are there: --resume carries out the others" in output_of("merge", *folders, "--out", merged)
     assert servobench(monkeypatch, *SWEEP, "--out", merged, "--resume") == 0
     assert_same_runs(tmp_path / "merged", undisturbed)
 
 
-def test_folders_that_are_no_parts_of_one_batch_are_not_merged(undisturbed, tmp_path, monkeypatch, capsys):
+def test_folders_that_are_no_parts_of_one_batch_are_not_merged(refusal_of, undisturbed, tmp_path, monkeypatch, capsys):
     part, other = *parts(tmp_path, monkeypatch, 3, (1,)), str(tmp_path / "other")
     servobench(monkeypatch, *SWEEP, "--seeds", "5", "--part", "1/9", "--out", other)
     capsys.readouterr()
@@ -96,15 +95,13 @@ def test_folders_that_are_no_parts_of_one_batch_are_not_merged(undisturbed, tmp_
         other: "seeds 0:5 there",
     }
     for folder, words in wrong.items():
-        assert servobench(monkeypatch, "merge", part, folder, "--out", str(tmp_path / "merged")) == 2
-        assert words in capsys.readouterr().err
+        assert words in refusal_of("merge", part, folder, "--out", tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
 
 
 @pytest.mark.parametrize("part", ["0/3", "4/3", "3", "a/b", "1/49"])
-def test_a_part_that_there_is_not_is_refused(part, tmp_path, monkeypatch, capsys):
-    assert servobench(monkeypatch, *SWEEP, "--part", part, "--out", str(tmp_path / "out")) == 2
-    assert "part" in capsys.readouterr().err
+def test_a_part_that_there_is_not_is_refused(refusal_of, part, tmp_path):
+    assert "part" in refusal_of(*SWEEP, "--part", part, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -127,11 +124,10 @@ def test_a_finished_sweep_is_not_run_again(undisturbed, monkeypatch, capsys):
     assert "camera_rotation=20deg" in capsys.readouterr().out
 
 
-def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(monkeypatch, capsys, tmp_path):
+def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(output_of, monkeypatch, tmp_path):
     out, alone = tmp_path / "periods", tmp_path / "alone"
     common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
-    assert servobench(monkeypatch, *common, "--period", "0.05,0.02", "--out", str(out)) == 0
-    assert "50" in capsys.readouterr().out
+    assert "50" in output_of(*common, "--period", "0.05,0.02", "--out", out)
     assert servobench(monkeypatch, *common, "--set", "run.period=0.02", "--out", str(alone)) == 0
     table, fast = results.load_runs(out), judged(results.load_runs(alone))
     assert table["period_s"].tolist() == [0.05, 0.05, 0.02, 0.02]
@@ -145,12 +141,11 @@ def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single
     )
 
 
-def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(monkeypatch, capsys, tmp_path):
+def test_any_setting_can_be_varied_and_is_a_column_with_the_rows_of_single_runs(output_of, monkeypatch, tmp_path):
     out, alone = tmp_path / "varied", tmp_path / "alone"
     common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
     varied = ("--vary", "kinematic.lag=0.02,0.1", "--vary", "plant.sensing.noise=white,uniform")
-    assert servobench(monkeypatch, *common, *varied, "--out", str(out)) == 0
-    assert "plant.lag" in capsys.readouterr().out
+    assert "plant.lag" in output_of(*common, *varied, "--out", out)
     single = ("--set", "kinematic.lag=0.1", "--set", "kinematic.sensing.noise=uniform")
     assert servobench(monkeypatch, *common, *single, "--out", str(alone)) == 0
     table, last = judged(results.load_runs(out)), judged(results.load_runs(alone))
@@ -174,13 +169,10 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
     assert len(results.load_runs(out)) >= 4
 
 
-def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(undisturbed, monkeypatch, capsys):
-    assert servobench(monkeypatch, *SWEEP, "--out", str(undisturbed)) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert servobench(monkeypatch, *SWEEP, "--seeds", "5", "--out", str(undisturbed), "--resume") == 2
-    assert "holds results of other runs or settings" in capsys.readouterr().err
-    assert servobench(monkeypatch, *SWEEP, "--set", "kinematic.lag=0.03", "--out", str(undisturbed), "--resume") == 2
-    assert "holds results of other runs or settings" in capsys.readouterr().err
+def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(refusal_of, undisturbed):
+    assert "exists already" in refusal_of(*SWEEP, "--out", undisturbed)
+    for other in (("--seeds", "5"), ("--set", "kinematic.lag=0.03")):
+        assert "holds results of other runs or settings" in refusal_of(*SWEEP, *other, "--out", undisturbed, "--resume")
 
 
 def test_variations_are_put_on_top_of_the_mismatch_one_by_one():

@@ -13,18 +13,17 @@ from servobench.harness.studies.tuning.spaces import default_values, find_tunabl
 SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]
 
 
-def test_code_of_users_has_no_search_space_and_is_not_imported(monkeypatch, capsys, tmp_path):
+def test_code_of_users_has_no_search_space_and_is_not_imported(refusal_of, tmp_path):
     (tmp_path / "mine.py").write_text("import pathlib\n\npathlib.Path(__file__).with_name('imported').touch()\n")
     place = f"{tmp_path / 'mine.py'}:Mine"
-    assert servobench(monkeypatch, "tune", "--controllers", place, "--out", str(tmp_path / "out")) == 2
-    assert capsys.readouterr().err.startswith(f"servobench: controller {place} has no search space: valid: ")
+    line = refusal_of("tune", "--controllers", place, "--out", tmp_path / "out")
+    assert line.startswith(f"servobench: controller {place} has no search space: valid: ")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
 
 
-def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypatch, capsys, tmp_path):
+def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(output_of, monkeypatch, tmp_path):
     out = tmp_path / "out"
-    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(out)) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    told = " ".join(output_of("tune", *SHORT, "--trials", "1", "--out", out).split())
     assert "at most 1 method × 1 studies × 1 points × 16 runs = 16 runs; --controllers, --studies, --trials" in told
     first = read_tuned(out / "rls.toml")
     assert first.settings == nested_settings(default_values(find_tunable("rls")))
@@ -49,16 +48,16 @@ def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whethe
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["constant.second.jsonl"]
 
 
-def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(monkeypatch, capsys, tmp_path):
+def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(refusal_of, monkeypatch, tmp_path):
     note = tmp_path / "note.txt"
     note.write_text("mine")
-    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(tmp_path)) == 2
-    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(note)) == 2
-    assert capsys.readouterr().err.count("exists already and holds no study; name another folder with --out") == 2
+    for out in (tmp_path, note):
+        line = refusal_of("tune", *SHORT, "--trials", "1", "--out", out)
+        assert "exists already and holds no study; name another folder with --out" in line
     out = str(tmp_path / "out")
     assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out) == 0
-    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out, "--offset", "40") == 2
-    assert "rls.jsonl was made with other robots; name another folder with --out" in capsys.readouterr().err
+    line = refusal_of("tune", *SHORT, "--trials", "1", "--out", out, "--offset", "40")
+    assert "rls.jsonl was made with other robots; name another folder with --out" in line
 
 
 def test_ctrl_c_keeps_the_study(tmp_path):

@@ -11,7 +11,7 @@ from kit.command import judged
 from kit.command import servobench as command
 from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
 from servobench.harness.batch.campaign import changed_source
-from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered, offering
+from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered
 from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
@@ -101,15 +101,6 @@ def test_a_class_is_taken_in_python_and_its_robot_may_be_its_own():
     assert run.row["outcome"] == "settled", run.row["reason"]
 
 
-def test_another_text_of_a_plant_is_refused_when_a_folder_is_resumed(tmp_path):
-    path = write(tmp_path, CELL, "cell.py")
-    asked = {"plants": ["./cell.py"], "settings": SHORT, "out": "folder"}
-    servobench.compare(["constant"], **asked)
-    path.write_text(CELL + "\n# changed\n")
-    with offering(), pytest.raises(ConfigurationError, match=r"begun with another version of cell\.py; name another"):
-        servobench.compare(["constant"], resume=True, **asked)
-
-
 def test_what_changed_since_a_batch_began_is_named():
     def manifest(text="1", arm="1"):
         plugin = {"place": "some.law:Mine", "distribution": "some 1.0", "sha256": text}
@@ -142,41 +133,26 @@ BROKEN = {
         "./cell.py defines no plant: no subclass of servobench.Plant or servobench.World and no ENTRY; "
         "it defines the controller Mine",
     ),
-    "no setup": (
-        CELL.replace("self, setup", "self"),
-        "cell.py:6: Cell.__init__ must take (self, setup) or (self, config, setup), got (self)",
-    ),
-    "an object": (
-        PLAIN_CELL + "from types import SimpleNamespace\nENTRY = Plain(SimpleNamespace(period=0.05))\n",
-        "./cell.py is a plant that is built already; give its class",
-    ),
-    "exception in the constructor": (
-        CELL.replace("setup.limits", "setup.limit"),
-        "plant Cell: cell.py:12: AttributeError: 'PlantSetup' object has no attribute 'limit'",
-    ),
-    "no spec": (
-        CELL.replace("self.spec = servobench", "spec = servobench"),
-        "plant Cell: Cell.__init__ must set self.spec to a servobench.PlantSpec, got nothing",
-    ),
-    "an entry that builds something else": (
-        CONFIGURED_CELL + ENTRY.replace("Cell)", "lambda config, setup: 3)"),
-        "plant cell: it is built as int, wanted a servobench.Plant",
-    ),
-    "an entry whose engine fails": (
-        CONFIGURED_CELL + ENTRY.replace("Cell)", "Cell, engine=lambda: 1 / 0)"),
-        "cell.py:42: ZeroDivisionError: division by zero",
-    ),
+    "no setup": (CELL.replace("self, setup", "self"),
+        "cell.py:6: Cell.__init__ must take (self, setup) or (self, config, setup), got (self)"),
+    "an object": (PLAIN_CELL + "from types import SimpleNamespace\nENTRY = Plain(SimpleNamespace(period=0.05))\n",
+        "./cell.py is a plant that is built already; give its class"),
+    "exception in the constructor": (CELL.replace("setup.limits", "setup.limit"),
+        "plant Cell: cell.py:12: AttributeError: 'PlantSetup' object has no attribute 'limit'"),
+    "no spec": (CELL.replace("self.spec = servobench", "spec = servobench"),
+        "plant Cell: Cell.__init__ must set self.spec to a servobench.PlantSpec, got nothing"),
+    "an entry that builds something else": (CONFIGURED_CELL + ENTRY.replace("Cell)", "lambda config, setup: 3)"),
+        "plant cell: it is built as int, wanted a servobench.Plant"),
+    "an entry whose engine fails": (CONFIGURED_CELL + ENTRY.replace("Cell)", "Cell, engine=lambda: 1 / 0)"),
+        "cell.py:42: ZeroDivisionError: division by zero"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(tmp_path, monkeypatch, capsys, what):
+def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(refusal_of, tmp_path, what):
     text, message = BROKEN[what]
     write(tmp_path, text, "cell.py")
-    assert command(monkeypatch, "run", "--plant", "./cell.py", "constant") == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"servobench: {message}")
-    assert error.count("\n") == 1
+    assert refusal_of("run", "--plant", "./cell.py", "constant").startswith(f"servobench: {message}")
     assert [path.name for path in tmp_path.iterdir()] == ["cell.py"]
 
 
@@ -197,22 +173,18 @@ def test_what_fails_in_a_run_is_a_row_that_says_where(tmp_path, line, with_, rea
     assert re.search(reason, table["reason"].iloc[0]), table["reason"].iloc[0]
 
 
-def test_an_empty_name_is_no_plant(monkeypatch, capsys):
-    assert command(monkeypatch, "run", "constant", "--plant", "") == 2
-    assert capsys.readouterr().err.startswith("servobench: unknown plant ''")
+def test_an_empty_name_is_no_plant(refusal_of):
+    assert refusal_of("run", "constant", "--plant", "").startswith("servobench: unknown plant ''")
 
 
-def test_a_plant_is_named_on_every_command_that_takes_one(no_figures, tmp_path, monkeypatch, capsys):
+def test_a_plant_is_named_on_every_command_that_takes_one(refusal_of, output_of, no_figures, tmp_path, monkeypatch):
     write(tmp_path, CONFIGURED_CELL, "cell.py")
-    assert command(monkeypatch, "plants", "./cell.py", "--json") == 0
-    assert json.loads(capsys.readouterr().out)[0]["setting"] == "Cell.speed"
-    assert command(monkeypatch, "check", "plant", "./cell.py") == 0
-    assert "./cell.py: keeps its contract" in capsys.readouterr().out
+    assert json.loads(output_of("plants", "./cell.py", "--json"))[0]["setting"] == "Cell.speed"
+    assert "./cell.py: keeps its contract" in output_of("check", "plant", "./cell.py")
     assert command(monkeypatch, "init", "--plants", "./cell.py", "cell.toml") == 0
     assert "[Cell]" in (tmp_path / "cell.toml").read_text()
     asked = ["--plants", "./cell.py", "--controllers", "constant", "--tasks", "exp1", "--no-report", "--workers", "1"]
-    assert command(monkeypatch, "compare", *asked, "--config", "cell.toml", "--out", "out") == 0
-    assert "exp1 on Cell, moderate" in capsys.readouterr().out
+    assert "exp1 on Cell, moderate" in output_of("compare", *asked, "--config", "cell.toml", "--out", "out")
     write(tmp_path, PLAIN_CELL, "own.py")
-    assert command(monkeypatch, "robustness", "--plant", "./own.py", "--controllers", "constant", "--out", "map") == 2
-    assert "the map varies the true robot, and plant Plain brings one of its own" in capsys.readouterr().err
+    line = refusal_of("robustness", "--plant", "./own.py", "--controllers", "constant", "--out", "map")
+    assert "the map varies the true robot, and plant Plain brings one of its own" in line

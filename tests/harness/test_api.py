@@ -1,16 +1,13 @@
 """`import servobench` as a user's script sees it."""
 
-import os
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import servobench
-from kit.command import PACKAGE, judged
+from kit.command import judged, python
 from kit.resting import Resting
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.faults import ConfigurationError
@@ -53,7 +50,7 @@ def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
     ("given", "words"),
     [
         ({"task": None}, "task must be a name, got None"),
-        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate'"),
+        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
         ({"robot": 3}, "robot must be a name, got 3"),
         ({"sensing": None}, "sensing must be a name, got None"),
         ({"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
@@ -106,14 +103,10 @@ def test_importing_the_package_imports_nothing_heavy_and_folders_of_the_same_nam
     for name in ("plant", "controllers", "harness", "fmus"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a foreign package')")
-    script = tmp_path / "script.py"
-    script.write_text(
+    (tmp_path / "script.py").write_text(
         "import sys, servobench\n"
         "assert not {'numpy', 'pandas'} & set(sys.modules)\n"
         "print(servobench.run('constant', settings={'exp1': {'duration': 0.5}}).row['status'])\n"
     )
-    done = subprocess.run(
-        [sys.executable, str(script)], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(PACKAGE)},
-        capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+    done = python("script.py", path=tmp_path)
     assert done.stdout.strip() == "completed", done.stderr

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from kit.command import servobench
+from kit.own import write
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.initial_jacobian import InitialConfig
 from servobench.controllers.methods import ESTIMATORS, LAWS
@@ -40,8 +40,7 @@ def assert_same(found, wanted):
 def test_a_file_of_everything_reads_back_to_the_same_settings(tmp_path):
     names = PLANTS, (*controller_names(), "mfac+rls"), tuple(TASKS)
     wanted = sections(*names)
-    path = tmp_path / "all.toml"
-    path.write_text(configuration_file(wanted, wanted, dict.fromkeys(wanted, "about"), "run"), encoding="utf-8")
+    path = write(tmp_path, configuration_file(wanted, wanted, dict.fromkeys(wanted, "about"), "run"), "all.toml")
     assert_same(sections(*names, path=path), wanted)
     read = tomllib.loads(path.read_text(encoding="utf-8"))
     for name, config in wanted.items():
@@ -52,12 +51,12 @@ def test_a_file_of_everything_reads_back_to_the_same_settings(tmp_path):
             assert (setting.name in section) == (setting.value is not None)
 
 
-def test_changed_settings_are_kept_and_their_defaults_told(monkeypatch, capsys, tmp_path):
+def test_changed_settings_are_kept_and_their_defaults_told(output_of, tmp_path):
     path = tmp_path / "bench.toml"
     changes = ("kinematic.sensing.feature_noise=0.5", "ukf_mfac.law.step_weight=0.25")
     arguments = [word for change in changes for word in ("--set", change)]
-    assert servobench(monkeypatch, "init", str(path), "--plants", "kinematic", *arguments) == 0
-    assert capsys.readouterr().out.replace("\n", "") == f"{path}: run, kinematic, ukf_mfac, exp2"
+    printed = output_of("init", path, "--plants", "kinematic", *arguments)
+    assert printed.replace("\n", "") == f"{path}: run, kinematic, ukf_mfac, exp2"
     names = ("kinematic",), ("ukf_mfac",), ("exp2",)
     assert_same(sections(*names, path=path), sections(*names, *changes))
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -68,21 +67,17 @@ def test_changed_settings_are_kept_and_their_defaults_told(monkeypatch, capsys, 
     assert max(map(len, (line for line in lines if line.startswith("#")))) <= 120
 
 
-def test_a_file_that_is_there_is_left_as_it_is(monkeypatch, capsys, tmp_path):
-    path = tmp_path / "bench.toml"
-    path.write_text("mine")
-    assert servobench(monkeypatch, "init", str(path)) == 2
-    assert capsys.readouterr().err == f"servobench: {path} exists already and is left as it is; name another file\n"
+def test_a_file_that_is_there_is_left_as_it_is(refusal_of, tmp_path):
+    path = write(tmp_path, "mine", "bench.toml")
+    assert refusal_of("init", path) == f"servobench: {path} exists already and is left as it is; name another file\n"
     assert path.read_text() == "mine"
     path = tmp_path / "none" / "bench.toml"
-    assert servobench(monkeypatch, "init", str(path)) == 2
-    assert capsys.readouterr().err == f"servobench: {path} cannot be written: No such file or directory\n"
+    assert refusal_of("init", path) == f"servobench: {path} cannot be written: No such file or directory\n"
 
 
-def test_a_dash_prints_the_file(monkeypatch, capsys, tmp_path):
+def test_a_dash_prints_the_file(output_of, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert servobench(monkeypatch, "init", "-", "--plants", "kinematic", "--tasks", "waypoints") == 0
-    text = capsys.readouterr().out
+    text = output_of("init", "-", "--plants", "kinematic", "--tasks", "waypoints")
     assert list(tomllib.loads(text)) == ["run", "kinematic", "ukf_mfac", "waypoints"]
     assert list(tmp_path.iterdir()) == []
 

@@ -111,45 +111,30 @@ BROKEN = {
     "relative import": ("from .law import Law\n", "mine.py:1: ImportError: attempted relative import"),
     "exception at import": ("1 / 0\n", "mine.py:1: ZeroDivisionError: division by zero"),
     "exit at import": ("import sys\nsys.exit(3)\n", "mine.py:2: SystemExit: 3"),
-    "no step": (
-        WHOLE.replace("def step", "def stepp"),
-        "mine.py:6: class Mine lacks step, which it must define",
-    ),
-    "no reset, no step": (
-        WHOLE.replace("def step", "def stepp").replace("def reset", "def rest"),
-        "mine.py:6: class Mine lacks reset and step, which it must define",
-    ),
-    "nothing in it": (
-        "import numpy\n",
-        "./mine.py defines no controller: no subclass of servobench.Controller and no ENTRY",
-    ),
+    "no step": (WHOLE.replace("def step", "def stepp"), "mine.py:6: class Mine lacks step, which it must define"),
+    "no reset, no step": (WHOLE.replace("def step", "def stepp").replace("def reset", "def rest"),
+        "mine.py:6: class Mine lacks reset and step, which it must define"),
+    "nothing in it": ("import numpy\n",
+        "./mine.py defines no controller: no subclass of servobench.Controller and no ENTRY"),
     "two of them": (TWO, "./mine.py defines Mine, Other; name one of them, such as ./mine.py:Mine"),
-    "no knowledge": (
-        WHOLE.replace("self, knowledge)", "self)").replace("knowledge.spec.n", "6"),
-        "mine.py:6: Mine.__init__ must take (self, knowledge) or (self, config, knowledge), got (self)",
-    ),
+    "no knowledge": (WHOLE.replace("self, knowledge)", "self)").replace("knowledge.spec.n", "6"),
+        "mine.py:6: Mine.__init__ must take (self, knowledge) or (self, config, knowledge), got (self)"),
     "too many arguments": (
         WHOLE.replace("self, knowledge", "self, gain, damping, knowledge"),
         "mine.py:6: Mine.__init__ must take (self, knowledge) or (self, config, knowledge), "
         "got (self, gain, damping, knowledge)",
     ),
-    "settings without a class": (
-        WHOLE.replace("self, knowledge", "self, config, knowledge"),
-        "mine.py:6: Mine.__init__ must name the dataclass of its settings, such as config: MineConfig",
-    ),
+    "settings without a class": (WHOLE.replace("self, knowledge", "self, config, knowledge"),
+        "mine.py:6: Mine.__init__ must name the dataclass of its settings, such as config: MineConfig"),
     "settings of an unknown class": (
         WHOLE.replace("self, knowledge", "self, config: 'Missing', knowledge"),
         "mine.py:6: Mine.__init__ must name the dataclass of its settings, such as config: MineConfig; "
         "NameError: name 'Missing' is not defined",
     ),
-    "settings without a default": (
-        CONFIGURED.replace("gain: float = 2.0", "gain: float"),
-        "mine.py:8: every field of MineConfig needs a default; gain has none",
-    ),
-    "settings that are no dataclass": (
-        CONFIGURED.replace("@dataclass(frozen=True)\n", ""),
-        "mine.py:8: the settings MineConfig are no dataclass; put @dataclass(frozen=True) above class MineConfig",
-    ),
+    "settings without a default": (CONFIGURED.replace("gain: float = 2.0", "gain: float"),
+        "mine.py:8: every field of MineConfig needs a default; gain has none"),
+    "settings that are no dataclass": (CONFIGURED.replace("@dataclass(frozen=True)\n", ""),
+        "mine.py:8: the settings MineConfig are no dataclass; put @dataclass(frozen=True) above class MineConfig"),
     "settings that fail": (
         CONFIGURED.replace("= 2.0", "= 2.0\n    def __post_init__(self):\n        raise ValueError('no')"),
         "mine.py:12: ValueError: no",
@@ -164,37 +149,26 @@ BROKEN = {
     "an entry whose class lacks a method": (
         CONFIGURED.replace("def step", "def stepp") + ENTRY, "mine.py:13: class Mine lacks step, which it must define",
     ),
-    "not derived": (
-        WHOLE.replace("(servobench.Controller)", "") + "ENTRY = Mine\n",
-        "./mine.py is the class Mine, wanted a subclass",
-    ),
-    "exception in the constructor": (
-        WHOLE.replace("knowledge.spec.n", "knowledge.size"),
-        "controller Mine: mine.py:10: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
-    ),
-    "numpy in the constructor": (
-        WHOLE.replace("knowledge.spec.n", "np.linalg.inv(np.zeros((2, 2)))"),
-        "controller Mine: mine.py:10: LinAlgError: Singular matrix",
-    ),
+    "not derived": (WHOLE.replace("(servobench.Controller)", "") + "ENTRY = Mine\n",
+        "./mine.py is the class Mine, wanted a subclass"),
+    "exception in the constructor": (WHOLE.replace("knowledge.spec.n", "knowledge.size"),
+        "controller Mine: mine.py:10: AttributeError: 'RobotKnowledge' object has no attribute 'size'"),
+    "numpy in the constructor": (WHOLE.replace("knowledge.spec.n", "np.linalg.inv(np.zeros((2, 2)))"),
+        "controller Mine: mine.py:10: LinAlgError: Singular matrix"),
     "exit in the constructor": (
         WHOLE.replace("self.n = knowledge.spec.n", "raise SystemExit"), "controller Mine: mine.py:10: SystemExit",
     ),
-    "an entry that builds something else": (
-        CONFIGURED + ENTRY.replace("Mine)", "lambda config, knowledge: 3)"),
-        "controller mine: it is built as int, wanted a servobench.Controller",
-    ),
+    "an entry that builds something else": (CONFIGURED + ENTRY.replace("Mine)", "lambda config, knowledge: 3)"),
+        "controller mine: it is built as int, wanted a servobench.Controller"),
 }  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(tmp_path, monkeypatch, capsys, what):
+def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(refusal_of, tmp_path, what):
     text, message = BROKEN[what]
     write(tmp_path, text)
-    assert command(monkeypatch, "run", "--plant", "kinematic", "--controller", "./mine.py") == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"servobench: {message}")
-    assert error.count("\n") == 1
+    assert refusal_of("run", "--plant", "kinematic", "--controller", "./mine.py").startswith(f"servobench: {message}")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
 
 

@@ -123,12 +123,12 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path
     assert not list(tmp_path.rglob("escaped*"))
 
 
-def test_no_picture_is_merged_to_a_place_that_a_run_names(tmp_path, monkeypatch, capsys):
+def test_no_picture_is_merged_to_a_place_that_a_run_names(refusal_of, tmp_path):
     (signed(tmp_path / "home" / "folder", run_id="../../picture") / "pictures").mkdir()
     (tmp_path / "home" / "picture.png").write_text("somebody's")
     (tmp_path / "out").mkdir()
-    assert servobench(monkeypatch, "merge", f"{tmp_path}/home/folder", "--out", f"{tmp_path}/out/merged") == 2
-    assert "is unfit for the name of a file" in capsys.readouterr().err
+    line = refusal_of("merge", f"{tmp_path}/home/folder", "--out", f"{tmp_path}/out/merged")
+    assert "is unfit for the name of a file" in line
     assert not list((tmp_path / "out").rglob("*.png"))
 
 
@@ -146,10 +146,8 @@ BOMB = pa.table({f"x{index}": pa.nulls(10**6, pa.float64()) for index in range(3
 WRONG = {
     "texts for numbers": (lambda runs: runs.assign(rms_error="much"), "has (large_)?string in the column rms_error"),
     "numbers for texts": (lambda runs: runs.assign(controller=1), "has int64 in the column controller, where texts"),
-    "no number that a metric has": (
-        lambda runs: runs.assign(overshoot=-np.inf),
-        "the column overshoot has the number -inf",
-    ),
+    "no number that a metric has": (lambda runs: runs.assign(overshoot=-np.inf),
+        "the column overshoot has the number -inf"),
     "a time below 0": (lambda runs: runs.assign(settling_time_s=-1.0), "the column settling_time_s has the number -1"),
     "a share above 1": (lambda runs: runs.assign(saturation_fraction=2.0), "saturation_fraction has the number 2"),
     "truths for numbers": (lambda runs: runs.assign(rms_error=True), "has bool in the column rms_error, where numbers"),
@@ -161,20 +159,18 @@ WRONG = {
         "a table has at most 10000",
     ),
     "a bomb": (lambda runs: BOMB.to_pandas(), r"is a bomb: it unpacks to 3e\+07 cells"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_a_table_of_wrong_columns_is_one_line(kind, tmp_path, monkeypatch, capsys):
+def test_a_table_of_wrong_columns_is_one_line(refusal_of, kind, tmp_path):
     folder = comparison(tmp_path / "folder", ("constant",), ("exp1",))
     change, words = WRONG[kind]
     changed = change(results.load_runs(folder))
     write_vouched(folder, {results.RUNS: changed.to_parquet})
     for command in ("statistics",) if kind == "a run twice" else ("statistics", "report"):
-        assert servobench(monkeypatch, command, str(folder)) == 2
-        error = capsys.readouterr().err
+        error = refusal_of(command, folder)
         assert re.search(words, error), error
-        assert error.count("\n") == 1
 
 
 def rewritten(name: str, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Callable[[Path], object]:
@@ -278,31 +274,28 @@ def test_an_odd_folder_is_read_or_refused_in_one_line(kind, tmp_path, monkeypatc
     assert said.err.count("\n") <= 1
 
 
-def test_checksums_of_files_elsewhere_are_not_looked_at(tmp_path, monkeypatch, capsys):
+def test_checksums_of_files_elsewhere_are_not_looked_at(output_of, tmp_path):
     folder = signed(tmp_path / "folder")
     with (folder / SUMS).open("a") as sums:
         sums.writelines(
             f"{'0' * 64}  {name}\n" for name in ("/dev/zero", "../victim", "parts/../../victim", "a\0b", "..")
         )
-    assert servobench(monkeypatch, "verify", str(folder)) == 0
-    assert "3 files are as they were written" in capsys.readouterr().out
+    assert "3 files are as they were written" in output_of("verify", folder)
 
 
-def test_a_terminal_obeys_no_word_of_a_folder(tmp_path, monkeypatch, capsys):
+def test_a_terminal_obeys_no_word_of_a_folder(output_of, tmp_path):
     rows = [made_up_row(f"{RUN}-{seed}", controller="a\x1b]0;b\x07\u202ec", seed=seed) for seed in range(2)]
     write_folder(tmp_path / "folder", rows, [])
     for form in ((), ("--markdown",), ("--json",), ("--latex",)):
-        assert servobench(monkeypatch, "statistics", str(tmp_path / "folder"), *form) == 0
-        said = capsys.readouterr().out
+        said = output_of("statistics", tmp_path / "folder", *form)
         assert files.harmless(said) == said
         assert "]0;b" in said
 
 
-def test_controllers_that_share_no_seed_are_no_pair(tmp_path, monkeypatch, capsys):
+def test_controllers_that_share_no_seed_are_no_pair(output_of, tmp_path):
     rows = [made_up_row(f"{name}-{seed}", controller=name, seed=seed) for name, seed in (("a", 0), ("b", 1))]
     write_folder(tmp_path / "folder", rows, [])
-    assert servobench(monkeypatch, "statistics", str(tmp_path / "folder")) == 0
-    assert "a − b" not in capsys.readouterr().out
+    assert "a − b" not in output_of("statistics", tmp_path / "folder")
 
 
 def test_empty_columns_of_numbers_have_the_type_of_numbers():

@@ -155,8 +155,6 @@ def test_nothing_is_rendered_unless_it_is_asked_for():
     [
         ({"plant": 3}, "plant must be a name, got 3"),
         ({"task": "retreat"}, "task retreat: it needs a target with a pose"),
-        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
-        ({"settings": {"kinematic.lag": 0.1}}, "settings must be sections with keys"),
         ({"task": "target", "settings": {"target": {"target": [9, 9, 9]}}}, "m out of the arm's reach"),
         ({"render_mode": "human"}, "render"),
     ],

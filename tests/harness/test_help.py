@@ -18,20 +18,13 @@ COMMANDS = [
 ]
 
 
-def shown(monkeypatch, capsys, *arguments):
+@pytest.fixture(autouse=True)
+def _a_terminal_of_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    assert servobench(monkeypatch, *arguments) == 0
-    return capsys.readouterr().out
 
 
-def wide(monkeypatch, capsys, *arguments):
-    monkeypatch.setenv("COLUMNS", "300")
-    assert servobench(monkeypatch, *arguments) == 0
-    return capsys.readouterr().out
-
-
-def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_columns(monkeypatch, capsys):
-    text = shown(monkeypatch, capsys)
+def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_columns(output_of):
+    text = output_of()
     listed = [line[2:13].strip() for line in text.partition("First steps")[2].splitlines() if line.startswith("│")]
     assert listed == list(ROOT.commands)
     assert listed[:2] == ["run", "compare"]
@@ -40,39 +33,35 @@ def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_c
     assert titles == ["Options", *PANELS]
 
 
-def test_a_group_lists_each_command_in_one_line(monkeypatch, capsys):
-    text = shown(monkeypatch, capsys, "fmu", "--help").partition("Commands")[2]
+def test_a_group_lists_each_command_in_one_line(output_of):
+    text = output_of("fmu", "--help").partition("Commands")[2]
     assert [line.split()[1] for line in text.splitlines() if line.startswith("│")] == [
-        "export",
-        "ssp",
-        "validate",
-        "info",
-    ]
+        "export", "ssp", "validate", "info",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
-def test_every_command_explains_itself_and_its_values_and_nothing_is_cut(monkeypatch, capsys, name):
-    text = shown(monkeypatch, capsys, *name.split(), "-h" if name == "run" else "--help")
+def test_every_command_explains_itself_and_its_values_and_nothing_is_cut(output_of, name):
+    text = output_of(*name.split(), "-h" if name == "run" else "--help")
     assert f"Usage: servobench {name}".strip() in text
     assert "\\" not in text
     assert not re.search(r"<(?!date-time)|…", text)
     assert re.search(r"^│ (   )?--help +-h +Show this message and exit\.", text, re.MULTILINE)
 
 
-def test_no_word_in_brackets_is_taken_for_markup(monkeypatch, capsys):
-    assert "a [section] for each" in wide(monkeypatch, capsys, "run", "--help")
+def test_no_word_in_brackets_is_taken_for_markup(output_of, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert "a [section] for each" in output_of("run", "--help")
     written = typer.main.get_command(app).commands
     for name in PANELS["First steps"] + PANELS["Studies"]:
-        text = wide(monkeypatch, capsys, name.__name__, "--help")
+        text = output_of(name.__name__, "--help")
         for each in written[name.__name__].params:
             for words in re.findall(r"\[.*?\]", each.help or ""):
                 assert words in text
 
 
-def test_version_and_commit_are_told(monkeypatch, capsys):
-    assert re.fullmatch(
-        r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", shown(monkeypatch, capsys, "--version")
-    )
+def test_version_and_commit_are_told(output_of):
+    assert re.fullmatch(r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", output_of("--version"))
 
 
 @pytest.mark.parametrize(
@@ -85,11 +74,8 @@ def test_version_and_commit_are_told(monkeypatch, capsys):
         (("fmu", "info"), "missing argument 'FILE'; see servobench fmu info --help"),
     ],
 )
-def test_a_call_that_cannot_be_understood_is_one_line(monkeypatch, capsys, arguments, line):
-    assert servobench(monkeypatch, *arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"servobench: {line}")
-    assert error.count("\n") == 1
+def test_a_call_that_cannot_be_understood_is_one_line(refusal_of, arguments, line):
+    assert refusal_of(*arguments).startswith(f"servobench: {line}")
 
 
 def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
@@ -123,19 +109,15 @@ def test_one_row_declares_name_help_completion_check_and_absence_of_an_option():
 @pytest.mark.parametrize(
     ("words", "read"),
     [
-        (
-            ["robustness", "--plants", "kinematic", "--axis=links"],
-            ["robustness", "--plant", "kinematic", "--axes=links"],
-        ),
+        (["robustness", "--plants", "kinematic", "--axis=links"],
+         ["robustness", "--plant", "kinematic", "--axes=links"]),
         (["run", "--controllers", "constant"], ["run", "--controller", "constant"]),
-        (
-            ["compare", "--seed", "7", "--controller", "constant"],
-            ["compare", "--seeds", "7,", "--controllers", "constant"],
-        ),
+        (["compare", "--seed", "7", "--controller", "constant"],
+         ["compare", "--seeds", "7,", "--controllers", "constant"]),
         (["sweep", "--seed=7", "--mismatches", "none"], ["sweep", "--seeds=7,", "--mismatch", "none"]),
         (["tune", "--robot", "ur5"], ["tune", "--robot", "ur5"]),
         (["fmu", "export", "--robots", "ur5"], ["fmu", "export", "--robot", "ur5"]),
     ],
-)
+)  # fmt: skip
 def test_options_are_taken_in_singular_and_plural(words, read):
     assert in_known_number(command_line(), words) == read

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from kit.lanes import alone as one_by_one
-from kit.lanes import rows
+from kit.lanes import assert_rows_of_single_runs, rows
 from kit.nightly import some
 from kit.plants import NEEDS_BULLET
 from servobench.controllers.laws.mfac import MfacLaw
@@ -51,16 +51,15 @@ def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():
     together = runs("ukf_mfac:published", {"random": {"duration": 2.5}}, mismatch=words)
     assert together[0].plant.sensing.outliers == 0.2
     assert side_by_side_key(together[0]) != side_by_side_key(runs("ukf_mfac:published", {}, mismatch="moderate")[0])
-    alone = one_by_one(together)
+    alone = assert_rows_of_single_runs(together)
     assert len({row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}) == len(SEEDS)
-    np.testing.assert_equal(rows(carry_out_together(together)), alone)
 
 
-def test_runs_that_lose_the_feature_leave_the_others_alone():
-    together = runs("ukf_mfac", lossy(0.7, 9))
-    alone = one_by_one(together)
-    assert {row["status"] for row in alone} == {"completed", "feature_lost"}
-    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+@pytest.mark.parametrize(
+    ("settings", "ends"), [(lossy(0.7, 9), {"completed", "feature_lost"}), (lossy(0.99, 3), {"feature_lost"})]
+)
+def test_runs_that_lose_the_feature_leave_the_others_alone_and_have_their_rows(settings, ends):
+    assert {row["status"] for row in assert_rows_of_single_runs(runs("ukf_mfac", settings))} == ends
 
 
 @pytest.mark.parametrize("kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError])
@@ -75,16 +74,7 @@ def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkey
 
     together = runs("ukf_mfac:published", ROUGH)
     monkeypatch.setattr(MfacLaw, "command", fragile)
-    alone = one_by_one(together)
-    assert {"completed"} < {row["status"] for row in alone}
-    np.testing.assert_equal(rows(carry_out_together(together)), alone)
-
-
-def test_a_block_of_which_every_run_ends_early_has_all_its_rows():
-    together = runs("ukf_mfac", lossy(0.99, 3))
-    alone = one_by_one(together)
-    assert {row["status"] for row in alone} == {"feature_lost"}
-    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+    assert {"completed"} < {row["status"] for row in assert_rows_of_single_runs(together)}
 
 
 @NEEDS_BULLET

@@ -17,35 +17,34 @@ from servobench.harness.run.tasks import TASKS
 from servobench.plant.kinematic import ENTRY
 
 
-def shown(monkeypatch, capsys, *arguments):
+@pytest.fixture(autouse=True)
+def _a_terminal_of_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    assert servobench(monkeypatch, *arguments) == 0
-    return capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["plants", "controllers", "tasks"])
-def test_lists_fit_into_80_columns_and_no_name_is_broken(monkeypatch, capsys, kind):
-    text = shown(monkeypatch, capsys, kind)
+def test_lists_fit_into_80_columns_and_no_name_is_broken(output_of, kind):
+    text = output_of(kind)
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
     listed = [line.split()[0] for line in text.split("\n\n")[0].splitlines() if not line.startswith(" ")]
-    assert listed == [each["name"] for each in json.loads(shown(monkeypatch, capsys, kind, "--json"))]
+    assert listed == [each["name"] for each in json.loads(output_of(kind, "--json"))]
 
 
-def test_all_names_and_summaries_are_there_as_json(monkeypatch, capsys):
-    found = json.loads(shown(monkeypatch, capsys, "controllers", "--json"))
+def test_all_names_and_summaries_are_there_as_json(output_of):
+    found = json.loads(output_of("controllers", "--json"))
     assert [each["name"] for each in found] == controller_names()
-    listed = json.loads(shown(monkeypatch, capsys, "tasks", "--json"))
+    listed = json.loads(output_of("tasks", "--json"))
     assert listed == [{"name": name, "summary": entry.summary} for name, entry in TASKS.items()]
 
 
-def test_settings_are_explained_to_readers_and_programs(monkeypatch, capsys):
-    found = json.loads(shown(monkeypatch, capsys, "plants", "kinematic", "--json"))
+def test_settings_are_explained_to_readers_and_programs(output_of):
+    found = json.loads(output_of("plants", "kinematic", "--json"))
     wanted = json.loads(json.dumps({f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()}))
     assert {each["setting"]: each["default"] for each in found} == wanted
     lag = next(each for each in found if each["setting"] == "kinematic.lag")
     assert (lag["unit"], lag["allowed"]) == ("s", "≥ 0")
-    text = shown(monkeypatch, capsys, "plants", "kinematic")
+    text = output_of("plants", "kinematic")
     assert "kinematic.lag = 0.05\n    [s] τ, time constant of the joints' velocity loops; 0 means none (≥ 0)" in text
 
 
@@ -104,15 +103,15 @@ def test_words_that_bash_splits_at_colons_and_equals_signs_are_joined_as_they_we
     assert join_words([*words, "after"], len(words) - 1) == (joined, before)
 
 
-def test_a_run_takes_its_controller_first(no_figures, monkeypatch, capsys, tmp_path):
+def test_a_run_takes_its_controller_first(refusal_of, no_figures, monkeypatch, tmp_path):
     short = ("--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out"))
     assert servobench(monkeypatch, "run", "constant", *short) == 0
     assert load_runs(tmp_path / "out")["run_id"].tolist() == ["kinematic-constant-exp2-moderate-0"]
-    assert servobench(monkeypatch, "run", "constant", "--controller", "rls") == 2
-    assert "two controllers are named, constant and --controller rls; a run has one" in capsys.readouterr().err
+    line = refusal_of("run", "constant", "--controller", "rls")
+    assert "two controllers are named, constant and --controller rls; a run has one" in line
 
 
-def test_a_task_is_shown_for_an_arm(monkeypatch, capsys):
+def test_a_task_is_shown_for_an_arm(refusal_of, monkeypatch, capsys):
     def settings(*arguments):
         assert servobench(monkeypatch, "tasks", "circle", "--json", *arguments) == 0
         return {each["setting"]: each["default"] for each in json.loads(capsys.readouterr().out)}
@@ -121,19 +120,16 @@ def test_a_task_is_shown_for_an_arm(monkeypatch, capsys):
     assert usual == settings("--robot", "ur5")
     assert other["circle.radius"] > 1.3 * usual["circle.radius"]
     assert other["circle.start"] != usual["circle.start"]
-    assert servobench(monkeypatch, "tasks", "--robot", "ur10e") == 2
-    assert "--robot shows the settings of one task" in capsys.readouterr().err
+    assert "--robot shows the settings of one task" in refusal_of("tasks", "--robot", "ur10e")
 
 
 @pytest.mark.parametrize("name", ["tune", "claims"])
-def test_a_command_without_arms_says_why(monkeypatch, capsys, name):
-    assert servobench(monkeypatch, name, "--robot", "panda") == 2
-    error = capsys.readouterr().err
+def test_a_command_without_arms_says_why(refusal_of, name):
+    error = refusal_of(name, "--robot", "panda")
     assert error.startswith(f"servobench: {name} has no --robot: ")
     assert "UR5" in error
 
 
 @pytest.mark.parametrize("name", ["tune", "claims", "record", "controllers"])
-def test_a_command_without_cameras_says_why(monkeypatch, capsys, name):
-    assert servobench(monkeypatch, name, "--sensing", "pixel") == 2
-    assert capsys.readouterr().err.startswith(f"servobench: {name} has no --sensing: ")
+def test_a_command_without_cameras_says_why(refusal_of, name):
+    assert refusal_of(name, "--sensing", "pixel").startswith(f"servobench: {name} has no --sensing: ")

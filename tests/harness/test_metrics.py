@@ -6,7 +6,7 @@ import pytest
 
 from kit.straight_move import CONDITION, SPEC, VELOCITY, straight_move
 from servobench.harness.run.log import StepLog
-from servobench.harness.run.metrics import judge_run, overshoot, path_length, settling_time, sign_switches
+from servobench.harness.run.metrics import judge_run, overshoot, settling_time, sign_switches
 from servobench.plant.contract.signals import column_unit
 
 PERIOD = 0.1
@@ -58,10 +58,6 @@ def test_settling_and_overshoot_agree_with_python_control():
 
 def test_no_overshoot_when_the_feature_stops_short():
     assert overshoot(np.array([[0.0, 0.5], [0.0, 0.2]]), np.array([1.0, 0.0])) == 0.0
-
-
-def test_the_path_length_of_a_square_is_its_circumference():
-    assert path_length(np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]], dtype=float)) == 4.0
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 
 import servobench
-from kit.own import WHOLE
+from kit.own import CELL, WHOLE
 from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
-from servobench.harness.config.registry import offering
 from servobench.harness.config.source import neighbours
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
@@ -19,14 +18,8 @@ MINE = "import helper\nfrom laws import gain\n" + WHOLE.replace(
 )
 CODE = {"mine.py": MINE, "helper.py": "SPEED = 0.01\n", "laws/__init__.py": "", "laws/gain.py": "VALUE = 1.0\n"}
 WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0.4,0.1,1.2\n1,0.4,0.0,1.2\n"
+pytestmark = pytest.mark.usefixtures("own_folder")
 SHORT = {"exp1": {"duration": 0.2}}
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with offering():
-        yield tmp_path
 
 
 def write(files):
@@ -54,10 +47,27 @@ def task():
     return {"tasks": ["waypoints"], "settings": {"waypoints": {"file": "path.csv", "settle": 0.1}}}
 
 
+def plant():
+    write({"cell.py": CELL})
+    return {"plants": ["./cell.py"]}
+
+
+def sensing():
+    write(
+        {
+            "side.py": "from servobench.plant.cameras.setups import SensingSetup\n"
+            "SIDE = SensingSetup('side', '', ('x', 'y', 'z'), 'm', lambda points, optics: points[..., 0, 0, :])\n"
+        }
+    )
+    return {"plants": ["kinematic"], "sensings": ["./side.py"]}
+
+
 CASES = {  # what is asked for, and which file changes
     "robot": (robot, "arm.yaml"),
     "mismatch": (mismatch, "factory.yaml"),
     "task": (task, "path.csv"),
+    "plant": (plant, "cell.py"),
+    "sensing": (sensing, "side.py"),
 }
 
 
@@ -95,11 +105,11 @@ def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():
     assert found["pilot.fmu"] == hashlib.sha256(b"2").hexdigest()
 
 
-def test_neighbours_are_found_through_packages_and_relative_imports(here):
+def test_neighbours_are_found_through_packages_and_relative_imports(tmp_path):
     write({
         "mine.py": "import numpy\nimport a.b\nfrom c import thing\n", "a/__init__.py": "", "a/b.py": "from . import d",
         "a/d.py": "import mine\n", "a/unused.py": "", "c.py": "if False:\n    import e\n", "e.py": "def broken(:\n",
         "f.py": "",
     })  # fmt: skip
-    names = [str(path.relative_to(here)) for path in neighbours(here / "mine.py", here)]
+    names = [str(path.relative_to(tmp_path)) for path in neighbours(tmp_path / "mine.py", tmp_path)]
     assert names == ["a/__init__.py", "a/b.py", "a/d.py", "c.py", "e.py"]

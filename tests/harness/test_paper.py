@@ -2,12 +2,11 @@
 
 import re
 import shutil
-import subprocess
 
 import pandas as pd
 import pytest
 
-from kit.command import servobench
+from kit.command import carried_out, servobench
 from servobench.harness.analysis.folder import latex_tables
 
 TABLE = pd.DataFrame(
@@ -52,9 +51,8 @@ def printed(tmp_path_factory):
     return folder / "out"
 
 
-def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(monkeypatch, capsys, printed):
-    assert servobench(monkeypatch, "statistics", str(printed), "--latex") == 0
-    text = capsys.readouterr().out
+def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(output_of, printed):
+    text = output_of("statistics", printed, "--latex")
     assert r"All runs were made with servobench 0." in text
     assert re.search(r"Python 3\.\d+\.\d+, numpy [\d.]+, scipy [\d.]+\)", text)
     assert "Controllers: constant, calibrated; tasks: exp2; plant: kinematic (UR5)" in text
@@ -67,10 +65,7 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
 def test_a_page_of_a_paper_can_be_typeset_with_what_is_printed(monkeypatch, capsys, printed, tmp_path):
     servobench(monkeypatch, "statistics", str(printed), "--latex")
     (tmp_path / "page.tex").write_text(PAGE % capsys.readouterr().out)
-    made = subprocess.run(
-        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    made = carried_out("pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex", cwd=tmp_path)
     if "IEEEtran.cls' not found" in made.stdout or "booktabs.sty' not found" in made.stdout:
         pytest.skip("this TeX has no IEEEtran or no booktabs")
     assert made.returncode == 0, made.stdout[-2000:]

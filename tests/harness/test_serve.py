@@ -17,7 +17,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kit.command import servobench
 from kit.served import REQUEST, SPEED, Bytes, commanding, connected, packed, served, waited_for
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment
@@ -396,6 +395,6 @@ def test_an_arm_without_six_joints_is_no_ur():
         Server(replace(REQUEST, robot="panda"), Settings({}), print)
 
 
-def test_a_name_is_no_address(monkeypatch, capsys):
-    assert servobench(monkeypatch, "serve", "--address", "robot") == 2
-    assert "--address: 'robot' does not appear to be an IPv4 or IPv6 address" in capsys.readouterr().err
+def test_a_name_is_no_address(refusal_of):
+    line = refusal_of("serve", "--address", "robot")
+    assert "--address: 'robot' does not appear to be an IPv4 or IPv6 address" in line

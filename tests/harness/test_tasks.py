@@ -20,13 +20,7 @@ from servobench.plant.contract.faults import ConfigurationError
 
 PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
 (SPIRAL,) = (block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block)
-
-
-@pytest.fixture(autouse=True)
-def in_a_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
+pytestmark = pytest.mark.usefixtures("own_folder")
 WRONG = "from servobench import TaskEntry\nENTRY = TaskEntry('wrong', 'a number', 3)"
 
 
@@ -53,10 +47,9 @@ def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_fil
     assert "spiral.py" in " ".join(manifest["files"])
 
 
-def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(no_figures, tmp_path, monkeypatch, capsys):
+def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(output_of, no_figures, tmp_path, monkeypatch):
     write(tmp_path, SPIRAL, "spiral.py")
-    assert command(monkeypatch, "tasks", "./spiral.py") == 0
-    assert "Spiral.radius = 0.1" in capsys.readouterr().out
+    assert "Spiral.radius = 0.1" in output_of("tasks", "./spiral.py")
     options = ("--plants", "kinematic", "--controllers", "constant", "--tasks", "round=./spiral.py", "--out", "runs")
     options += ("--workers", "1", "--no-report")
     assert command(monkeypatch, "compare", *options, "--set", "round.radius=0.2") == 0
@@ -98,12 +91,10 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
     [
         (("return Scenario", "Scenario"), "its method scenario must return a servobench.Scenario, got None"),
         (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at each .*, got .*nan"),
-        (
-            ("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
-            r"its .* 3 finite features .*got shape \(12, 2\)",
-        ),
+        (("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
+         r"its .* 3 finite features .*got shape \(12, 2\)"),
     ],
-)
+)  # fmt: skip
 def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, change, words):
     write(tmp_path, "from servobench.harness.run.references import FixedPoint\n" + SPIRAL.replace(*change), "spiral.py")
     with pytest.raises(ConfigurationError, match=f"^task Spiral: {words}"):

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import psutil
@@ -36,6 +37,17 @@ def start(*arguments: str, path: Path = PACKAGE, **environment: str) -> subproce
     )  # fmt: skip
 
 
+def carried_out(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Return how a command ended, with what it wrote to standard output and error."""
+    return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
+
+
+def python(*words: object, path: Path = PACKAGE, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Return how Python ended with arguments in the folder `path`, which is searched for packages, too."""
+    own = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{path}", **environment}
+    return carried_out(sys.executable, *words, cwd=path, env=own, timeout=900)
+
+
 def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
     """Wait for a process and return its exit code and what it wrote to standard output and error."""
     output, errors = process.communicate(timeout=300)
@@ -54,9 +66,9 @@ def left_behind(mark: str, value: str) -> list[str]:
     return found
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
     """Wait until a condition holds."""
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)

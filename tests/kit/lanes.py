@@ -20,6 +20,8 @@ def alone(resolved: Sequence[ResolvedRun]) -> list[dict[str, object]]:
     return rows([carry_out(run, steps=False) for run in resolved])
 
 
-def assert_rows_of_single_runs(resolved: Sequence[ResolvedRun]) -> None:
-    """Compare the rows of runs side by side with those of each alone, bit for bit."""
-    np.testing.assert_equal(rows(carry_out_together(resolved)), alone(resolved))
+def assert_rows_of_single_runs(resolved: Sequence[ResolvedRun]) -> list[dict[str, object]]:
+    """Compare the rows of runs side by side with those of each alone, bit for bit, and return them."""
+    single = alone(resolved)
+    np.testing.assert_equal(rows(carry_out_together(resolved)), single)
+    return single

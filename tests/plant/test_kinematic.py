@@ -74,8 +74,3 @@ def test_a_joint_stops_at_its_range():
     assert observation.joint_position[2] == -2.4
     moved = plant.step(Command(np.ones(6))).joint_position[2] + 2.4
     assert 0 < moved < 0.05  # no wind-up at the stop
-
-
-def test_a_period_must_be_positive():
-    with pytest.raises(ValueError, match="period must be above 0"):
-        make(period=0.0)
