@@ -1,11 +1,8 @@
 """The exported UR5: validation, agreement with numpy, derivatives, saved states, equal bytes, and what may go wrong."""
 
 import importlib.util
-import os
 import shutil
 import struct
-import subprocess
-import sys
 import tempfile
 import zipfile
 from dataclasses import replace
@@ -14,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from kit.command import carried_out, python
 from kit.plants import mismatched, nominal_ur5, setup
 from servobench.fmus import compiler as compiling
 from servobench.fmus import export
@@ -44,7 +40,7 @@ from servobench.fmus.variables import parameters_of
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import PIXEL, pixels
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import JOINT_NAMES
@@ -69,13 +65,6 @@ def test_the_committed_reference_is_still_that_of_the_model(version):
             own_header, came = read_table(archive.read(name).decode())
             assert own_header == header
             np.testing.assert_allclose(came, wanted, rtol=0, atol=tolerance)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.tuples(*[st.integers(-314, 314).map(lambda k: k / 100)] * 3), st.sampled_from([None, np.pi / 2, -np.pi / 2]))
-def test_camera_and_arm_survive_the_way_through_the_parameters(rpy, pitch):
-    R = rotation_from_rpy((rpy[0], rpy[1] if pitch is None else pitch, rpy[2]))
-    np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(R)), R, rtol=0, atol=1e-12)
 
 
 def model_of(p, joint_names):
@@ -145,20 +134,14 @@ def test_equal_inputs_give_equal_files_in_another_process_folder_and_time(versio
     first = export_fmu(tmp_path / "first.fmu", ExportOptions(version, platforms=parse_platforms(platforms)))
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    changed = {"TMPDIR": str(elsewhere), "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "PYTHONPATH": path_of_packages()}
-    subprocess.run(
-        [sys.executable, "-c", EXPORT, str(version), platforms], cwd=elsewhere, env=os.environ | changed, check=True
-    )
+    changed = {"TMPDIR": str(elsewhere), "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo"}
+    python("-c", EXPORT, version, platforms, path=elsewhere, **changed)
     assert first.read_bytes() == (elsewhere / "again.fmu").read_bytes()
     assert [item.name for item in elsewhere.iterdir()] == ["again.fmu"]
     with zipfile.ZipFile(first) as archive:
         content = b"".join(archive.read(name) for name in archive.namelist())
     for path in (tempfile.gettempdir(), str(Path.home()), str(Path.cwd())):
         assert path.encode() not in content
-
-
-def path_of_packages() -> str:
-    return os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
 
 
 MAGIC = {
@@ -198,9 +181,7 @@ def test_the_sources_are_clean_c11_and_say_nothing(version, tmp_path):
     strict = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-fPIC", "-c"]
     files = [name.removeprefix("sources/") for name in names if name.endswith(".c")]
     compiler = shutil.which("cc") or "gcc"
-    done = subprocess.run(
-        [compiler, *strict, *files], check=False, cwd=tmp_path / "sources", capture_output=True, text=True
-    )
+    done = carried_out(compiler, *strict, *files, cwd=tmp_path / "sources")
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -209,8 +190,9 @@ def test_the_sources_are_clean_c11_and_say_nothing(version, tmp_path):
 def test_the_library_needs_libc_and_libm_only(version, tmp_path):
     folder = extract_fmu(cached_fmu(version))
     library = next((folder / "binaries").rglob("*.so"))
-    lines = subprocess.run(["readelf", "-d", str(library)], capture_output=True, text=True, check=True).stdout
-    needed = [line.partition("[")[2].rstrip("]") for line in lines.splitlines() if "NEEDED" in line]
+    lines = carried_out("readelf", "-d", library).stdout.splitlines()
+    needed = [line.partition("[")[2].rstrip("]") for line in lines if "NEEDED" in line]
+    assert needed
     assert set(needed) <= {"libc.so.6", "libm.so.6"}
 
 
@@ -229,26 +211,24 @@ def test_information_tells_version_platform_and_variables(version):
     assert all(variable.unit and variable.description for variable in described.modelVariables) or version == 2
 
 
-def tampered(path: Path, target: Path, name: str, change) -> Path:
-    with zipfile.ZipFile(path) as archive:
+def problems_of(target: Path, name: str, old: bytes, new: bytes) -> tuple[str, ...]:
+    """Return what is wrong with an FMU of which one file has other words at one place."""
+    with zipfile.ZipFile(cached_fmu(2)) as archive:
         contents = {entry: archive.read(entry) for entry in archive.namelist()}
-    contents[name] = change(contents[name])
+    contents[name] = contents[name].replace(old, new, 1)
     with zipfile.ZipFile(target, "w") as archive:
         for entry, content in contents.items():
             archive.writestr(entry, content)
-    return target
+    return validate_fmu(target).problems
 
 
 def test_validation_tells_what_is_wrong(tmp_path):
-    path = cached_fmu(2)
-    changed = tampered(path, tmp_path / "a.fmu", OUTPUT_FILE, lambda text: text.replace(b"\n0.05,", b"\n0.05,9", 1))
-    assert "differs from the reference" in validate_fmu(changed).problems[0]
-    unit = tampered(path, tmp_path / "b.fmu", "modelDescription.xml", lambda text: text.replace(b'"m/rad"', b'"x"', 1))
-    assert any("unit" in problem for problem in validate_fmu(unit).problems)
-    token = tampered(
-        path, tmp_path / "c.fmu", "modelDescription.xml", lambda text: text.replace(b'guid="{', b'guid="{0')
-    )
-    assert "the GUID is not that of this model" in validate_fmu(token).problems[0]
+    changed = problems_of(tmp_path / "a.fmu", OUTPUT_FILE, b"\n0.05,", b"\n0.05,9")
+    assert "differs from the reference" in changed[0]
+    unit = problems_of(tmp_path / "b.fmu", "modelDescription.xml", b'"m/rad"', b'"x"')
+    assert any("unit" in problem for problem in unit)
+    token = problems_of(tmp_path / "c.fmu", "modelDescription.xml", b'guid="{', b'guid="{0')
+    assert "the GUID is not that of this model" in token[0]
 
 
 def test_bad_exports_are_refused(tmp_path, monkeypatch):
@@ -258,8 +238,6 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         ExportOptions(2, platforms=())
     with pytest.raises(ValueError, match=r"platforms holds 'amiga'; known are x86_64-linux.*and 'all'"):
         parse_platforms("amiga")
-    with pytest.raises(ValueError, match="for the FMU does not exist"):
-        export_fmu(tmp_path / "missing" / "ur5.fmu", ExportOptions(2))
     with pytest.raises(ValueError, match="fmi_version must be one of 2, 3, got 4"):
         Ur5FmuConfig(fmi_version=4)
     monkeypatch.setattr(compiling.shutil, "which", lambda _: None)

@@ -1,7 +1,6 @@
 """The FMU plant: a foreign FMU in a closed loop, what may be wrong with one, and what must not be left behind."""
 
 import ctypes
-import logging
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -108,10 +107,7 @@ def test_a_step_that_ends_early_is_taken_up_where_it_ended_however_often(tmp_pat
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_failed_step_is_an_fmu_error_with_the_fmus_last_message(tmp_path, version, caplog):
     plant = crane(tmp_path, version, parameters={"quirk": np.array(1.0)})
-    with (
-        caplog.at_level(logging.ERROR, "servobench.fmu"),
-        pytest.raises(FmuError, match="load 900 kg is too heavy at noon"),
-    ):
+    with pytest.raises(FmuError, match="load 900 kg is too heavy at noon"):
         plant.step(Command([0.0, 0.0]))
     assert "load 900 kg" in caplog.text
     assert FmuError.status == "fmu_error"
@@ -219,17 +215,6 @@ def test_a_closed_plant_may_be_closed_again_but_not_stepped(tmp_path):
     plant.close()
     with pytest.raises(FmuError, match="has been closed"):
         plant.step(Command([0.0, 0.0]))
-
-
-def test_a_library_that_is_none_is_refused(tmp_path):
-    path = build_crane(tmp_path / "crane.fmu", 2)
-    with zipfile.ZipFile(path) as archive:
-        contents = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in contents.items():
-            archive.writestr(name, b"nonsense" if name.startswith("binaries") else content)
-    with pytest.raises(ValueError, match="cannot be loaded"):
-        FmuWorld(FmuMapping(path, **ROLES[2]), START, PERIOD)
 
 
 @pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a\\..\\evil.txt", "c:evil.txt", "a/../../evil.txt"])

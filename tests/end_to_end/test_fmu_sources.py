@@ -1,11 +1,11 @@
 """The C sources of exported FMUs, of a plant and of a controller: in clang-tidy's eyes, and under the sanitizers."""
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
+from kit.command import carried_out
 from kit.controller_fmus import recorded
 from night.random_calls import arm, build, can_sanitize, controller, run
 from servobench.fmus.export import ExportOptions, product
@@ -55,8 +55,7 @@ def write(exported, folder):
 
 def tidy(file, *, generated=False):
     checks = [f"--checks={CASADI}"] if generated else []
-    command = ["clang-tidy", "--quiet", f"--config-file={CONFIGURATION}", *checks, str(file), "--", "-std=c11"]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return carried_out("clang-tidy", "--quiet", f"--config-file={CONFIGURATION}", *checks, file, "--", "-std=c11")
 
 
 NEEDS_SANITIZERS = pytest.mark.skipif(not can_sanitize(), reason="needs a C compiler with sanitizers")

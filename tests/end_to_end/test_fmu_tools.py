@@ -9,7 +9,6 @@ import importlib.util
 import json
 import os
 import shutil
-import subprocess
 import sys
 import zipfile
 from functools import cache
@@ -20,6 +19,7 @@ import pytest
 from fmpy import simulate_fmu
 from fmpy.ssp.ssd import read_ssd
 
+from kit.command import carried_out
 from kit.plants import configure, mismatched
 from night.system_loops import Loop, agree, both, write
 from servobench.fmus.export import arm_layout, default_actuation
@@ -81,15 +81,9 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
         start = {name: values.tolist() for name, values in parameters(mismatch).items()}
         outputs = ["joint_position", "ball_position"]
     result = simulate_fmu(
-        str(cached_fmu(version)),
-        fmi_type="CoSimulation",
-        stop_time=STEPS * PERIOD,
-        output_interval=PERIOD,
-        step_size=PERIOD,
-        start_values=start,
-        input=signal,
-        output=outputs,
-    )
+        str(cached_fmu(version)), fmi_type="CoSimulation", stop_time=STEPS * PERIOD, output_interval=PERIOD,
+        step_size=PERIOD, start_values=start, input=signal, output=outputs,
+    )  # fmt: skip
     came = np.column_stack([result[name] for name in outputs])[1:]
     np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
 
@@ -113,9 +107,7 @@ def by_fmusim(version: int, kind: str, commands, folder) -> np.ndarray:
     wanted = [word for name in outputs for word in ("--output-variable", name)]
     times = ["--stop-time", str(stop), "--output-interval", str(PERIOD), "--tolerance", "1e-8", "--solver", "cvode"]
     files = ["--input-file", folder / "in.csv", "--output-file", folder / "out.csv", cached_fmu(version)]
-    done = subprocess.run(
-        [FMUSIM, "--interface-type", kind, *times, *wanted, *files], capture_output=True, text=True, check=False
-    )
+    done = carried_out(FMUSIM, "--interface-type", kind, *times, *wanted, *files)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = (folder / "out.csv").read_text(encoding="utf-8").replace('"', "").replace(",", " ").splitlines()[1:]
     came = np.array([[float(word) for word in row.split()] for row in rows])
@@ -147,10 +139,7 @@ def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
     (tmp_path / "in.csv").write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
     step = PERIOD if kind == "cs" else PERIOD / 1000  # it integrates by Euler's method
     times = ["-s", "1", "-n", "20", "-h", str(step), "-l", "4", "-k", kind]
-    done = subprocess.run(
-        [CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = carried_out(CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2))
     assert done.returncode == 0, done.stderr
     for line in ("0 warning(s) and error(s)", "0 Warning(s)", "0 Error(s)"):
         assert f"\t{line}" in done.stderr
@@ -220,8 +209,6 @@ def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tm
     content = {"fmu": str(cached_fmu(2)), "nanoseconds": round(PERIOD * 1e9), "commands": COMMANDS.tolist()}
     task.write_text(json.dumps(content | {name: list(values) for name, values in references.items()}))
     # In a process of its own: its C++ writes to the standard output and ends the process on what it does not like.
-    done = subprocess.run(
-        [sys.executable, "-c", COSIM, str(task), str(result)], capture_output=True, text=True, check=False
-    )
+    done = carried_out(sys.executable, "-c", COSIM, task, result)
     assert done.returncode == 0, done.stderr
     np.testing.assert_allclose(json.loads(result.read_text()), oracle(mismatch), rtol=0, atol=1e-9)

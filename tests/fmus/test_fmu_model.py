@@ -169,20 +169,25 @@ def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(versio
         np.testing.assert_allclose(opened.derivative("der(joint_position)", "joint_velocity"), np.eye(6))
 
 
+def assert_derivative(opened, unknown, known, **tolerances):
+    """Compare a directional derivative with differences."""
+    value, came = opened.get(known).copy(), opened.derivative(unknown, known)
+    for k, step in enumerate(1e-6 * np.eye(value.size)):
+        ends = []
+        for sign in (1.0, -1.0):
+            opened.set(known, value + sign * step)
+            ends.append(opened.get(unknown).copy())
+        opened.set(known, value)
+        message = f"{unknown} by {known}"
+        np.testing.assert_allclose(came[:, k], (ends[0] - ends[1]) / 2e-6, err_msg=message, **tolerances)
+
+
 @pytest.mark.parametrize(
     "parameter", ["a", "alpha", "pitch", "joint_offset", "gear_ratio", "tool", "camera_rpy", "base_rpy"]
 )
 def test_derivatives_by_parameters_equal_differences(parameter):
     with Opened(2) as opened:
-        value = opened.get(parameter).copy()
-        came = opened.derivative("ball_position", parameter)
-        for k in range(value.size):
-            column = 0.0
-            for sign in (1.0, -1.0):
-                opened.set(parameter, value + sign * 1e-6 * np.eye(value.size)[k])
-                column += sign * opened.get("ball_position").copy() / 2e-6
-            opened.set(parameter, value)
-            np.testing.assert_allclose(came[:, k], column, atol=1e-8)
+        assert_derivative(opened, "ball_position", parameter, atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -199,16 +204,8 @@ def test_derivatives_by_parameters_of_gears_and_tool_equal_differences(known):
         opened.instance.start(0.0)
         opened.set("joint_velocity_command", commands)
         opened.instance.stepper(0.3)(0.0)
-        value = opened.get(known).copy()
         for unknown in ("ball_position", "jacobian", "der(tool_deflection)", "der(tool_velocity)"):
-            came = opened.derivative(unknown, known)
-            for k in range(value.size):
-                column = 0.0
-                for sign in (1.0, -1.0):
-                    opened.set(known, value + sign * 1e-6 * np.eye(value.size)[k])
-                    column += sign * opened.get(unknown).copy() / 2e-6
-                opened.set(known, value)
-                np.testing.assert_allclose(came[:, k], column, rtol=1e-6, atol=1e-7, err_msg=f"{unknown} by {known}")
+            assert_derivative(opened, unknown, known, rtol=1e-6, atol=1e-7)
 
 
 def run(plant, count: int, seed: int) -> list[bytes]:
