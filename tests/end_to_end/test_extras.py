@@ -1,18 +1,16 @@
 """The command line starts without heavy packages, works without extras, and names the extra that is missing."""
 
 import json
-import subprocess
-import sys
 from importlib.metadata import version
 
 import pytest
 
+from kit.command import python
 from kit.folders import comparison
 from kit.forked import servobench_without
 from kit.plants import NEEDS_BULLET, NEEDS_MUJOCO
 from servobench.harness.config import installation as extras
 from servobench.harness.config import registry
-from servobench.harness.config import registry as engines
 from servobench.harness.config.installation import EXTRAS
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -33,7 +31,7 @@ try:
 finally:
     sys.stderr.write(' '.join(sorted(set(sys.modules) & {modules!r})))
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = python("-c", script)
     assert "Usage: servobench" in done.stdout
     assert done.stderr == ""
 
@@ -51,7 +49,7 @@ for listed in ("controllers", "plants", "tasks"):
         assert not end.code
 sys.stderr.write(' '.join(sorted(set(sys.modules) & {unused!r})))
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = python("-c", script)
     assert "ukf_mfac" in done.stdout
     assert done.stderr == ""
 
@@ -114,10 +112,8 @@ def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and
 @NEEDS_MUJOCO
 def test_without_pybullet_mujoco_is_the_rendered_plant(monkeypatch):
     monkeypatch.setattr(registry, "check_installed", lambda needs, what: needs == ("pybullet",) and refuse(what))
-    assert engines.default_plant() == (
-        "mujoco",
-        "" if extras.has_no_wheel() else "plant 'bullet' needs what is not here",
-    )
+    line = "" if extras.has_no_wheel() else "plant 'bullet' needs what is not here"
+    assert registry.default_plant() == ("mujoco", line)
 
 
 def refuse(what):

@@ -52,9 +52,7 @@ KILLING = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 @pytest.mark.parametrize("what", BROKEN)
@@ -154,22 +152,19 @@ def test_parts_that_say_so_are_checked_side_by_side(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KILLING)
-def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(tmp_path, monkeypatch, capsys, kind):
+def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(output_of, tmp_path, kind):
     write(tmp_path, KILLERS, "kill.py")
     check, line = KILLING[kind]
-    assert command(monkeypatch, "check", f"./kill.py:{kind}", "--limit", "3") == 1
-    lines = capsys.readouterr().out.splitlines()
+    lines = output_of("check", f"./kill.py:{kind}", "--limit", "3", code=1).splitlines()
     assert lines[0].split() == ["ok", "constructor"]
     assert lines[1].startswith(f"failed {check:15s}{line}"), lines
     assert lines[2:] == [f"./kill.py:{kind}: 1 of 2 checks failed"]
 
 
-def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(tmp_path, monkeypatch, capsys):
+def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(refusal_of, tmp_path, monkeypatch, capsys):
     write(tmp_path, WHOLE.replace("def step", "def stepp"))
-    assert command(monkeypatch, "check", "./mine.py") == 2
-    assert capsys.readouterr().err == "servobench: mine.py:6: class Mine lacks step, which it must define\n"
-    assert command(monkeypatch, "check", "robot", "./mine.py") == 2
-    assert "check needs a controller, or the word plant and a plant" in capsys.readouterr().err
+    assert refusal_of("check", "./mine.py") == "servobench: mine.py:6: class Mine lacks step, which it must define\n"
+    assert "check needs a controller, or the word plant and a plant" in refusal_of("check", "robot", "./mine.py")
     assert command(monkeypatch, "check", "plant") == 2
     assert (
         capsys.readouterr().err == "servobench: check plant needs a plant, such as servobench check plant ./cell.py\n"
@@ -191,26 +186,17 @@ def plant_with(**methods) -> PlantEntry:
 @pytest.mark.parametrize(
     ("methods", "check", "line"),
     [
-        (
-            {"reset": lambda own, seed: own(seed + (seed >= 0) * next(COUNT))},
-            "repeatable",
-            "reset with the same seed gives another run",
-        ),
+        ({"reset": lambda own, seed: own(seed + (seed >= 0) * next(COUNT))}, "repeatable",
+         "reset with the same seed gives another run"),
         ({"reset": lambda own, seed: own(abs(seed))}, "negative seed", "reset must refuse the seed -1"),
-        (
-            {"step": lambda own, u: own(Command(u.joint_velocity[:6]))},
-            "wrong size",
-            "step must refuse 7 joint velocities",
-        ),
+        ({"step": lambda own, u: own(Command(u.joint_velocity[:6]))}, "wrong size",
+         "step must refuse 7 joint velocities"),
         ({"truth": lambda own: replace(own(), jacobian=2 * own().jacobian)}, "truth", "truth().jacobian misses "),
-        (
-            {"save": lambda own: None, "restore": lambda own, state: None},
-            "save",
-            "after restore the run goes on otherwise",
-        ),
+        ({"save": lambda own: None, "restore": lambda own, state: None}, "save",
+         "after restore the run goes on otherwise"),
         ({"close": lambda own: 1 / 0}, "close", "ZeroDivisionError"),
     ],
-)
+)  # fmt: skip
 def test_a_broken_plant_fails_one_check_with_one_line(methods, check, line):
     report = servobench.check_plant(plant_with(**methods))
     assert [each.check for each in report.failures] == [check], report

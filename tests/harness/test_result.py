@@ -185,6 +185,7 @@ def wrong(name: str, method: str, answer: str) -> type[Controller]:
 
 
 STEP, RESET, LOOK = "step(self, observation, reference)", "reset(self, observation, seed)", "diagnostics(self)"
+TOO_FEW = "takes 2 positional arguments but 3 were given; it must be `def"
 TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in rad/s"
 
 
@@ -197,45 +198,23 @@ TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in ra
         (STEP, "Command", f"step must return a Command, got the class Command; {TO_WRITE}"),
         (STEP, "Command(np.zeros(5))", "step must return a Command of shape (6,), one rad/s a joint, got (5,)"),
         (STEP, "Command(np.zeros((6, 1)))", "step must return a Command of shape (6,), one rad/s a joint, got (6, 1)"),
-        (
-            "step(self, observation)",
-            "Command(np.zeros(6))",
-            "Wrong.step() takes 2 positional arguments but 3 were given; "
-            "it must be `def step(self, observation, reference)`",
-        ),
-        (
-            "reset(self, observation)",
-            "None",
-            "Wrong.reset() takes 2 positional arguments but 3 were given; "
-            "it must be `def reset(self, observation, seed)`",
-        ),
+        ("step(self, observation)", "Command(np.zeros(6))", f"Wrong.step() {TOO_FEW} {STEP}`"),
+        ("reset(self, observation)", "None", f"Wrong.reset() {TOO_FEW} {RESET}`"),
         (RESET, "observation", "reset must return nothing, got Observation; keep it in self"),
-        (
-            LOOK,
-            "None",
-            "diagnostics must return a mapping of names to numbers, got None; write `return {}` if there are none",
-        ),
+        (LOOK, "None",
+         "diagnostics must return a mapping of names to numbers, got None; write `return {}` if there are none"),
         (LOOK, "{'error': np.zeros(3)}", "diagnostics must hold numbers, got 'error': ndarray of shape (3,)"),
         (LOOK, "{'state': 'good'}", "diagnostics must hold numbers, got 'state': str"),
         (LOOK, "{3: 1.0}", "diagnostics must have texts of one line and at most 100 letters as names, got 3"),
-        (
-            "estimated_jacobian(self)",
-            "np.zeros((6, 3))",
-            "estimated_jacobian must return an array of shape (3, 6) or None, got ndarray of shape (6, 3)",
-        ),
-        (
-            "estimated_jacobian(self)",
-            "np.full((3, 6), object())",
-            "estimated_jacobian must hold real numbers, got object",
-        ),
-        (
-            LOOK,
-            "{f'{name}': 1.0 for name in range(257)}",
-            "diagnostics must keep to the same names, at most 256: each is a column; got 257, among them '256'",
-        ),
+        ("estimated_jacobian(self)", "np.zeros((6, 3))",
+         "estimated_jacobian must return an array of shape (3, 6) or None, got ndarray of shape (6, 3)"),
+        ("estimated_jacobian(self)", "np.full((3, 6), object())",
+         "estimated_jacobian must hold real numbers, got object"),
+        (LOOK, "{f'{name}': 1.0 for name in range(257)}",
+         "diagnostics must keep to the same names, at most 256: each is a column; got 257, among them '256'"),
         (STEP, "object.__setattr__(observation, 'time', 7.0)", "step changes its arguments; work on a copy"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_answer_is_told_with_what_to_write_instead(method, answer, words):
     kind = wrong("Wrong", method, answer)
     result = servobench.run(kind, task="exp2", settings=SHORT)
