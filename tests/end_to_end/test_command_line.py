@@ -3,22 +3,20 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from kit.command import judged, servobench
+from kit.command import carried_out, judged, servobench
 from kit.plants import NEEDS_BULLET
 
 
-def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_path):
+def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
     out = tmp_path / "out"
     arguments = ["run", "--plant", "kinematic", "--controller", "calibrated", "--task", "exp2", "--seed", "3"]
-    assert servobench(monkeypatch, *arguments, "--set", "exp2.duration=3", "--out", str(out)) == 0
-    assert "calibrated" in capsys.readouterr().out
+    assert "calibrated" in output_of(*arguments, "--set", "exp2.duration=3", "--out", out)
     runs, steps = pd.read_parquet(out / "runs.parquet"), pd.read_parquet(out / "steps.parquet")
     assert runs[["status", "seed", "mismatch"]].values.tolist() == [["completed", 3, "moderate"]]
     assert len(steps) == 60
@@ -35,30 +33,24 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
 
 @pytest.mark.parametrize("plant", ["kinematic", pytest.param("bullet", marks=NEEDS_BULLET)])
 def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
-    no_figures, monkeypatch, tmp_path, plant
+    no_figures, output_of, tmp_path, plant
 ):
     tables = []
     for workers in ("1", "2"):
         out = tmp_path / workers
-        assert (
-            servobench(
-                monkeypatch, "compare", "--plants", plant, "--controllers", "ukf_mfac,constant",
-                "--tasks", "exp2,random", "--mismatch", "moderate", "--seeds", "5:6", "--workers", workers,
-                "--out", str(out), "--set", "exp2.duration=1", "--set", "random.duration=1", "--no-report",
-            )
-            == 0
-        )  # fmt: skip
+        asked = ["--plants", plant, "--controllers", "ukf_mfac,constant", "--tasks", "exp2,random", "--seeds", "5:6"]
+        asked += ["--set", "exp2.duration=1", "--set", "random.duration=1", "--mismatch", "moderate", "--no-report"]
+        output_of("compare", *asked, "--workers", workers, "--out", out)
         tables.append([judged(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")])
     for single, double in zip(*tables, strict=True):
         assert len(single) >= 4
         pd.testing.assert_frame_equal(single, double, check_exact=True)
 
 
-def test_a_run_without_figures_leaves_its_tables_only(monkeypatch, tmp_path, capsys):
+def test_a_run_without_figures_leaves_its_tables_only(output_of, tmp_path):
     out = tmp_path / "out"
     arguments = ("run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--no-figures")
-    assert servobench(monkeypatch, *arguments, "--out", str(out)) == 0
-    assert f"tables in {out}" in " ".join(capsys.readouterr().out.split())
+    assert f"tables in {out}" in " ".join(output_of(*arguments, "--out", out).split())
     assert sorted(path.name for path in out.iterdir()) == [
         "SHA256SUMS", "manifest.json", "runs.parquet", "steps.parquet",
     ]  # fmt: skip
@@ -78,8 +70,6 @@ def test_tests_that_are_started_with_interrupts_ignored_can_interrupt_neverthele
         "import signal\n\n\ndef test_it():\n    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
     )
     tests = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "test_handler.py"]
-    done = subprocess.run(
-        ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests], cwd=tmp_path, check=False, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
-    )  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = carried_out("sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stdout

@@ -12,7 +12,7 @@ from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.batch import results
 from servobench.harness.pictures import report
-from servobench.plant.contract.checksums import SUMS, write_vouched
+from servobench.plant.contract.checksums import write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 
 needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
@@ -82,25 +82,23 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
     assert f"The page shows {report.SHOWN_RUNS} of 3001 runs" in page
 
 
-def test_the_path_of_the_report_is_told_at_the_end(monkeypatch, capsys, tmp_path):
+def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS))
     run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1"]
-    assert servobench(monkeypatch, *run, "--report", "--out", str(tmp_path / "a")) == 0
-    assert capsys.readouterr().out.strip().splitlines()[-1].startswith(f"report: {tmp_path / 'a'}")
-    assert servobench(monkeypatch, *run, "--out", str(tmp_path / "b")) == 0
-    assert "report:" not in capsys.readouterr().out
+    *_, last = output_of(*run, "--report", "--out", tmp_path / "a").strip().splitlines()
+    assert last.startswith(f"report: {tmp_path / 'a'}")
+    assert "report:" not in output_of(*run, "--out", tmp_path / "b")
     assert made == [tmp_path / "a"]
 
 
-def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(monkeypatch, capsys, tmp_path):
+def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(output_of, monkeypatch, tmp_path):
     def fail(folder, out):
         raise ConfigurationError(f"report on {folder}: out of luck")
 
     monkeypatch.setattr(report, "write_report", fail)
     run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1", "--report"]
-    assert servobench(monkeypatch, *run, "--out", str(tmp_path / "out")) == 0
-    assert "no report: report on" in capsys.readouterr().out
+    assert "no report: report on" in output_of(*run, "--out", tmp_path / "out")
     assert len(results.load_runs(tmp_path / "out")) == 1
 
 
@@ -112,21 +110,10 @@ def test_a_folder_with_further_tables_shows_them(tmp_path):
     assert not (folder / report.NAME).exists()
 
 
-def test_folders_that_cannot_be_reported_are_one_line(monkeypatch, capsys, tmp_path):
-    foreign = comparison(tmp_path / "foreign")
-    (foreign / SUMS).unlink()
-    (foreign / results.MANIFEST).write_text('{"schema_version": "0"}')
+def test_a_folder_that_cannot_be_reported_is_one_line(refusal_of, tmp_path):
     empty = comparison(tmp_path / "empty")
     write_vouched(empty, {results.RUNS: pd.read_parquet(empty / results.RUNS).iloc[:0].to_parquet})
-    for folder, words in (
-        (foreign, "has results of schema '0'; this servobench reads"),
-        (empty, "holds no finished run"),
-        (tmp_path / "none", "is not a results folder"),
-    ):
-        assert servobench(monkeypatch, "report", str(folder)) == 2
-        error = capsys.readouterr().err
-        assert words in error
-        assert error.count("\n") == 1
+    assert "holds no finished run" in refusal_of("report", empty)
 
 
 def test_a_page_that_cannot_be_written_is_named(monkeypatch, tmp_path):

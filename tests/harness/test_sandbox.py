@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from kit.command import PACKAGE, left_behind, wait_for
+from kit.command import PACKAGE, left_behind, python, wait_for
 from servobench.harness.batch import sandbox
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
@@ -89,10 +89,12 @@ if __name__ == "__main__":
 @pytest.mark.skipif(sys.platform != "linux", reason="the signals that a process blocks are read from /proc")
 def test_ctrl_c_does_not_reach_the_first_guard_while_it_starts(tmp_path):
     (tmp_path / "starts.py").write_text(UNTOUCHED)
-    path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
-    done = subprocess.run([sys.executable, str(tmp_path / "starts.py")], capture_output=True, text=True, env=path,
-                          check=False, timeout=120)  # fmt: skip
+    done = python("starts.py", path=tmp_path)
     assert done.stdout == "True\n", done.stderr
+
+
+def has_ended(process):
+    return not psutil.pid_exists(process) or psutil.Process(process).status() == "zombie"
 
 
 KILLED = """
@@ -127,14 +129,9 @@ SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
 def test_what_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
     (tmp_path / "killed.py").write_text(KILLED.format(starts=starts))
     (tmp_path / "imported.py").write_text(SLOW)
-    path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
-    done = subprocess.run([sys.executable, "killed.py"], capture_output=True, text=True, env=path, check=False,
-                          timeout=120, cwd=tmp_path)  # fmt: skip
+    done = python("killed.py", path=tmp_path)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    below, deadline = [int(word) for word in done.stdout.split()], time.monotonic() + 5.0
-    while left := [each for each in below if psutil.pid_exists(each) and psutil.Process(each).status() != "zombie"]:
-        assert time.monotonic() < deadline, left
-        time.sleep(0.05)
+    wait_for(lambda: all(map(has_ended, map(int, done.stdout.split()))), 5.0)
 
 
 STUCK = """
@@ -159,10 +156,7 @@ def test_a_guard_that_has_not_yet_imported_anything_large_ends_with_a_killed_com
     with subprocess.Popen(command, env=environment, cwd=tmp_path) as process:
         wait_for((tmp_path / "begun").exists)
         process.kill()
-    deadline = time.monotonic() + 5.0
-    while left := left_behind("STUCK", str(tmp_path)):
-        assert time.monotonic() < deadline, left
-        time.sleep(0.05)
+    wait_for(lambda: not left_behind("STUCK", str(tmp_path)), 5.0)
 
 
 def wait_for_file(path: Path, tell) -> None:
@@ -225,7 +219,4 @@ def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
     ended = sandbox.call(stop_for_ever, None, Limits(time=1.0), told.append)
     assert ended is not None
     assert ended.status == "timed_out"
-    deadline = time.monotonic() + 5.0
-    while psutil.pid_exists(told[0]) and psutil.Process(told[0]).status() != "zombie":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(lambda: has_ended(told[0]), 5.0)
