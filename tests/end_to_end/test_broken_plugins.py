@@ -2,12 +2,11 @@
 
 import json
 import os
-import subprocess
 import sys
 
 import pytest
 
-from kit.command import PACKAGE
+from kit.command import PACKAGE, carried_out
 from kit.own import CELL, CONFIGURED, install, write
 from servobench.harness.config.registry import RENDERED
 
@@ -168,10 +167,9 @@ def told(tmp_path_factory):
     for name, text in MODULES.items():
         write(site, text, f"some_{name}.py")
     write(folder, "".join(f"[{name}]\ngain = 1\n" for name in ("import-error", "gone")), "all.toml")
-    done = subprocess.run(
-        [sys.executable, "-c", DRIVER, json.dumps(list(COMMANDS.values()))], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}, check=False, timeout=900,
-    )  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}
+    driver = sys.executable, "-c", DRIVER, json.dumps(list(COMMANDS.values()))
+    done = carried_out(*driver, cwd=folder, env=environment, timeout=900)
     assert done.returncode == 0, done.stderr
     return dict(zip(COMMANDS, json.loads(done.stdout.splitlines()[-1]), strict=True))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
-from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
+from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods
 from kit.fmpy_instance import Driven
 from kit.nightly import some
 from servobench.fmus.inspection import validate_fmu
@@ -20,13 +20,8 @@ from servobench.plant.contract.faults import ConfigurationError
 
 PERIOD, N, M = 0.05, 6, 3
 METHODS = [
-    "ukf_mfac:published",
-    "rbf_pid:published",
-    "rbfnn_mfac:published",
-    "regression_mfac",
-    "ukf_mfac",
-    "rbfnn_mfac",
-]
+    "ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "regression_mfac", "ukf_mfac", "rbfnn_mfac",
+]  # fmt: skip
 INPUTS = 0  # value reference of the first input
 
 
@@ -159,20 +154,6 @@ def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
             controller.fmu.setReal([INPUTS], [np.nan])
         with pytest.raises(Exception, match="fmi2SetReal failed"):
             controller.fmu.setReal(controller.outputs[:1], [0.0])
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("ukf_mpc", "controller 'ukf_mpc' has no exported form: it holds something that is no formula"),
-        ("calibrated", "controller 'calibrated' cannot be exported: it is given the true robot"),
-        ("ukf_mfak", "ukf_mfac"),
-    ],
-)
-def test_a_controller_without_an_exported_form_is_refused_by_a_line(name, message):
-    with pytest.raises(ConfigurationError, match=message) as refused:
-        recorded(name)
-    assert "\n" not in str(refused.value)
 
 
 def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch):

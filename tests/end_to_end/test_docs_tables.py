@@ -152,12 +152,8 @@ def test_every_status_is_told_and_can_occur():
         return own.union(*(faults(child) for child in kind.__subclasses__()))
 
     assert {names(row[0])[0] for row in rows} == faults(RunFault) | {
-        COMPLETED,
-        NUMERICAL_ERROR,
-        CRASHED,
-        TIMED_OUT,
-        OUT_OF_MEMORY,
-    }
+        COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT, OUT_OF_MEMORY,
+    }  # fmt: skip
 
 
 def test_the_profiles_have_the_magnitudes_of_the_code():

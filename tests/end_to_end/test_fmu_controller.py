@@ -98,16 +98,14 @@ def test_a_foreign_controller_and_a_foreign_plant_close_a_loop_without_code(tmp_
     ("text", "message"),
     [
         (MAPPING.replace('"feature"', '"featur"'), "features names 'featur', which map.fmu does not have"),
-        (
-            MAPPING.replace('["joint_position"]', '["seen"]'),
-            "joints must name 6 numbers for 6 joints and 3 features, got 3",
-        ),
+        (MAPPING.replace('["joint_position"]', '["seen"]'),
+         "joints must name 6 numbers for 6 joints and 3 features, got 3"),
         (MAPPING.replace('joints = ["joint_position"]', 'joints = ["joint_velocity_command"]'), "causality output"),
         (MAPPING.replace('"reference"', '"feature"'), r"reference and features both name the input 'feature\[1\]'"),
         (MAPPING.replace("outputs =", "output ="), "the key 'outputs' is missing"),
         (MAPPING.replace("map.fmu", "none.fmu"), "none.fmu"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_mapping_is_refused_by_a_line(tmp_path, text, message):
     (tmp_path / "map.fmu").write_bytes(exported("ukf_mfac:published", 2).read_bytes())
     (tmp_path / "bad.toml").write_text(text)

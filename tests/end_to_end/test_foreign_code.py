@@ -10,6 +10,7 @@ import pytest
 from kit import foreign_fmu
 from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe
+from kit.own import write
 from servobench.fmus.compiler import this_platform
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.harness.batch import results
@@ -38,17 +39,14 @@ def mapping(tmp_path) -> Path:
         archive.writestr(f"binaries/{this_platform().folder(2)}/crane{this_platform().suffix}", library.read_bytes())
         archive.writestr(INPUT_FILE, "time,push.slew,push.luff\n0,0,0\n0.05,0,0\n")
         archive.writestr(OUTPUT_FILE, "time,wheel.slew,wheel.luff\n0,0.5,0.4\n0.05,0.5,0.4\n")
-    path = tmp_path / "crane.toml"
-    path.write_text(foreign_fmu.mapping(2))
-    return path
+    return write(tmp_path, foreign_fmu.mapping(2), "crane.toml")
 
 
-def test_an_fmu_that_ends_its_process_ends_no_command(mapping, monkeypatch, capsys):
+def test_an_fmu_that_ends_its_process_ends_no_command(output_of, mapping, monkeypatch):
     file = str(mapping.with_name("crane.fmu"))
-    assert servobench(monkeypatch, "fmu", "info", file) == 0
-    assert "wheel.slew" in capsys.readouterr().out
-    assert servobench(monkeypatch, "fmu", "validate", file) == 1
-    assert "the reference run ended: the run killed the process that carried it out: SIGABRT" in capsys.readouterr().out
+    assert "wheel.slew" in output_of("fmu", "info", file)
+    printed = output_of("fmu", "validate", file, code=1)
+    assert "the reference run ended: the run killed the process that carried it out: SIGABRT" in printed
     out = mapping.with_name("out")
     plants = ("--plants", f"fmu:{mapping}", "--workers", "1", "--out", str(out))
     assert servobench(monkeypatch, "sweep", *plants, *RUN) == 0
@@ -59,8 +57,7 @@ def test_an_fmu_that_ends_its_process_ends_no_command(mapping, monkeypatch, caps
 
 def test_an_fmu_that_the_user_trusts_shares_a_process(tmp_path, monkeypatch):
     build_crane(tmp_path / "crane.fmu", 2)
-    path = tmp_path / "crane.toml"
-    path.write_text(foreign_fmu.mapping(2))
+    path = write(tmp_path, foreign_fmu.mapping(2), "crane.toml")
     plant = f"fmu:{path}"
     for trusted in (False, True):
         settings = Settings({plant: {"isolate": not trusted}})

@@ -52,10 +52,7 @@ def places(*names: str) -> str:
 
 
 def assert_nothing_stays(mark: str) -> None:
-    deadline = time.monotonic() + SOON
-    while left := left_behind(MARK, mark):
-        assert time.monotonic() < deadline, left
-        time.sleep(0.05)
+    wait_for(lambda: not left_behind(MARK, mark), SOON)
 
 
 @pytest.fixture(scope="module")

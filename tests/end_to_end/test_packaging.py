@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from kit.command import carried_out
+
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / ".ci"))
 import release  # noqa: E402 - a script beside the package
@@ -134,10 +136,10 @@ def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
 
 def test_the_citation_is_one_of_its_format(tmp_path):
     check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.citation-file-format"]
-    done = subprocess.run([*check, str(ROOT / "CITATION.cff")], capture_output=True, text=True, check=False)
+    done = carried_out(*check, ROOT / "CITATION.cff")
     assert done.returncode == 0, done.stdout
     bad = tmp_path / "CITATION.cff"
     bad.write_text((ROOT / "CITATION.cff").read_text().replace("type: article", "type: leaflet"))
-    done = subprocess.run([*check, str(bad)], capture_output=True, text=True, check=False)
+    done = carried_out(*check, bad)
     assert done.returncode == 1
     assert "'leaflet' is not one of" in done.stdout

@@ -4,12 +4,11 @@ import errno
 import json
 import os
 import shutil
-import subprocess
 import sys
 
 import pytest
 
-from kit.command import PACKAGE, servobench
+from kit.command import PACKAGE, carried_out, servobench
 from kit.folders import comparison
 from kit.robots import calibration_text
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
@@ -115,10 +114,8 @@ def told(tmp_path_factory):
     (folder / "arm.yaml").write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
     (folder / "steps.csv").write_text(two_steps())
     without = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.geteuid() == 0 else []
-    made = subprocess.run(
-        [*without, sys.executable, "-c", SCRIPT], cwd=folder, input=json.dumps(CASES), capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": str(PACKAGE)}, check=True,
-    )  # fmt: skip
+    own = os.environ | {"PYTHONPATH": str(PACKAGE)}
+    made = carried_out(*without, sys.executable, "-c", SCRIPT, cwd=folder, input=json.dumps(CASES), env=own)
     return json.loads(made.stdout)
 
 

@@ -297,21 +297,17 @@ def steps_of(**values: object) -> str | None:
         (told(row=told()["row"] | {"rms_error": "small"}), "its rms_error is 'small', wanted a value of type float"),
         (told(row=told()["row"] | {"controller_time_p99_us": -math.inf}), "its controller_time_p99_us is -inf"),
         (told(row=told()["row"] | {"saturation_fraction": 1.5}), "its saturation_fraction is 1.5"),
-        (
-            told(row=told()["row"] | {"two\nlines": 1.0}),
-            "it has two columns of one name, or a name that cannot be printed",
-        ),
+        (told(row=told()["row"] | {"two\nlines": 1.0}),
+         "it has two columns of one name, or a name that cannot be printed"),
         (told(steps="AAAA"), "reading magic string"),
         (told(steps=blocks._pack_array(np.array([("a",)], dtype=[("x", "U1")]))), "its steps are no numbers"),
         (told(steps=steps_of(time_s=0.0)), "its table of steps lacks the column error_norm"),
         (told(steps=steps_of(time_s=math.nan, error_norm=0.0)), "its steps have no times"),
-        (
-            told(steps=steps_of(time_s=0.0, error_norm=0.0, **{"a\x1b": 0.0})),
-            "its table of steps has two columns of one",
-        ),
+        (told(steps=steps_of(time_s=0.0, error_norm=0.0, **{"a\x1b": 0.0})),
+         "its table of steps has two columns of one"),
         (told(picture=blocks._pack_array(np.zeros((2, 2)))), "its picture is no image"),
     ],
-)
+)  # fmt: skip
 def test_an_answer_that_was_falsified_is_refused(answer, why):
     with pytest.raises(ValueError, match=why):
         blocks.unpack_result(job(0, None).cell, answer)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from kit.command import servobench
+from kit.own import write
 from servobench import run
 from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.identification import (
@@ -249,8 +249,7 @@ def test_what_is_printed_names_units_and_what_the_log_does_not_tell():
 
 def test_a_twin_has_the_features_and_the_uncertainty_of_the_log(tmp_path):
     log, _, model = logged()
-    path = tmp_path / "twin.toml"
-    path.write_text(twin_text(identified(), log, command_response(log), (ROBOT, "position")), encoding="utf-8")
+    path = write(tmp_path, twin_text(identified(), log, command_response(log), (ROBOT, "position")), "twin.toml")
     request = RunRequest("kinematic", "constant", "random", read_mismatch("none"), 0, robot=str(path))
     mean = draw_robot(request)[0]
     q = log.joints[::20]
@@ -297,8 +296,7 @@ def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, 
     assert told.latency < 0.02
     assert 0.0008 < np.sqrt(np.diag(told.noise)).max() < 0.0025
     assert told.lost < 0.05
-    path = tmp_path / "twin.toml"
-    path.write_text(twin_text(robot, log, command_response(log), ("ur5", "position")), encoding="utf-8")
+    path = write(tmp_path, twin_text(robot, log, command_response(log), ("ur5", "position")), "twin.toml")
     row = run("constant", robot=str(path), mismatch="none", settings={"exp1": {"duration": 1.0}}).row
     assert row["status"] == "completed"
 
@@ -349,31 +347,30 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
     assert abs(wanted[ELBOW]) > 1.0
 
 
-def test_the_command_writes_a_twin_that_other_commands_take(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path):
     _, table, _ = logged()
     log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
     table.drop(columns=[name for name in table if name.startswith("true_")]).to_csv(log, index=False)
-    assert servobench(monkeypatch, "identify", str(log), "--robot", ROBOT, "--out", str(out)) == 0
-    assert "gear_elbow" in capsys.readouterr().out
+    assert "gear_elbow" in output_of("identify", log, "--robot", ROBOT, "--out", out)
     assert out.read_text(encoding="utf-8").startswith(f'robot = "{ROBOT}"')
     row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row
     assert row["outcome"] == "settled"
 
 
-def test_the_command_names_a_mistake_with_exit_code_1_and_writes_nothing(tmp_path, monkeypatch, capsys):
+def test_the_command_names_a_mistake_with_exit_code_1_and_writes_nothing(output_of, tmp_path):
     _, table, _ = logged()
     log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
     features = [name for name in table if name.startswith("feature_") and name.endswith("_m")]
     table.assign(**{name: 1e3 * table[name] for name in features}).to_csv(log, index=False)
-    assert servobench(monkeypatch, "identify", str(log), "--robot", ROBOT, "--out", str(out)) == 1
-    assert "they are likely in mm; write them in m" in capsys.readouterr().out
+    printed = output_of("identify", log, "--robot", ROBOT, "--out", out, code=1)
+    assert "they are likely in mm; write them in m" in printed
     assert not out.exists()
 
 
-def test_missing_rows_are_a_mistake_with_exit_code_1(tmp_path, monkeypatch, capsys):
+def test_missing_rows_are_a_mistake_with_exit_code_1(output_of, tmp_path):
     logged()[1].drop(index=range(50, 60)).to_csv(tmp_path / "robot.csv", index=False)
-    assert servobench(monkeypatch, "identify", str(tmp_path / "robot.csv"), "--robot", ROBOT) == 1
-    assert "row 50 is 0.55 s after the row before" in capsys.readouterr().out.replace("\n", " ")
+    printed = output_of("identify", tmp_path / "robot.csv", "--robot", ROBOT, code=1).replace("\n", " ")
+    assert "row 50 is 0.55 s after the row before" in printed
 
 
 def test_logs_that_are_too_short_or_of_other_cameras_are_refused():

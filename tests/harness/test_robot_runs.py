@@ -95,8 +95,6 @@ def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     assert (config.initial.source, known.initial.source) == ("probe", "nominal")
     assert config.estimator == type(config.estimator)() != known.estimator
     assert (config.law, config.aids) == (known.law, known.aids)
-    with pytest.raises(ConfigurationError, match="source 'nominal' needs a nominal model"):
-        build_experiment(request, Settings({"ukf_mfac": {"initial": {"source": "nominal"}}}))
     assert run_experiment(request, Settings(), steps=False).row["outcome"] == "settled"
     with pytest.raises(ConfigurationError, match="controllers know none of random_arm_3"):
         train_networks("rbfnn_mfac", Settings(), lambda share, what: None, "random_arm:3")
