@@ -189,6 +189,20 @@ def test_no_result_is_written_before_every_study_has_ended(made_up, tmp_path):
     assert write_results(tmp_path, methods) == {}
 
 
+def test_no_result_is_written_before_every_known_value_has_its_score_on_the_second_set(made_up, tmp_path):
+    plan = plan_of("rls", trials=len(first_points("rls")) + 2)
+    assert write_results(tmp_path, carried_out(tmp_path, plan))
+    ledger = tmp_path / "rls.second.jsonl"
+    header, *points = ledger.read_bytes().splitlines(keepends=True)
+    assert len(points) > 1
+    for k in range(len(points)):
+        ledger.write_bytes(b"".join([header, *points[:k], *points[k + 1 :]]))
+        methods = open_methods(tmp_path, plan)
+        methods[0].wanted()
+        assert all(study.outcome is not None for study in methods[0].studies)
+        assert write_results(tmp_path, methods) == {}
+
+
 @pytest.mark.parametrize(
     ("runs", "part"),
     [

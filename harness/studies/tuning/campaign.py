@@ -11,7 +11,6 @@ are those of the coordinate search: each other value of each switch, and 20 % mo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -156,10 +155,10 @@ class Method:
         """
         outcomes = [each.outcome for each in self.studies if each.outcome is not None]
         candidates = [*(each.settings for each in outcomes), *self._scored()]
-        costs = [self.second.costs(each) for each in candidates]
-        mean = [math.inf if each is None else score(each) for each in costs]
-        if len(outcomes) < len(self.studies) or math.inf in mean[: len(outcomes)]:
+        costs = [each for each in map(self.second.costs, candidates) if each is not None]
+        if len(outcomes) < len(self.studies) or len(costs) < len(candidates):
             return None
+        mean = [score(each) for each in costs]
         best, runs = candidates[mean.index(min(mean))], self._plan.runs
         mine, theirs = self.ledger.costs(best), self.ledger.costs(self._default)
         on_second = self.second.costs(self._default)
