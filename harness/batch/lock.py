@@ -207,8 +207,11 @@ def is_unused(folder: Path) -> bool:
     """Return whether a folder is missing, empty, or of a batch that ended before its first run."""
     if not folder.is_dir():
         return not folder.exists()
+    parts = folder / PARTS
     try:
-        left = (path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name))
-        return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in left)
+        left = {path for path in folder.iterdir() if path.name not in (LOCK, SUMS)}
+        if parts.is_dir():
+            left = left - {parts} | set(parts.iterdir())
     except FileNotFoundError:  # another process has just put its parts together
         return False
+    return all(PARTIAL.fullmatch(path.name) for path in left)

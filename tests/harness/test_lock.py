@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from kit.command import PACKAGE
-from servobench.harness.batch.lock import LOCK, Holder, locked
+from servobench.harness.batch.lock import LOCK, Holder, is_unused, locked
 from servobench.plant.contract.faults import ConfigurationError
 
 HOLD = """
@@ -67,6 +67,23 @@ def test_a_lock_that_is_given_back_leaves_nothing_and_can_be_taken_again(tmp_pat
             with pytest.raises(ConfigurationError, match=f"process {os.getpid()} of"), locked(tmp_path / "out"):
                 pass
         assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("names", [[], [LOCK], [".manifest.json-12-3"], ["parts/"], ["parts/.part-0.parquet-12-3"]])
+def test_a_folder_of_a_batch_that_was_killed_before_its_first_run_is_unused(tmp_path, names):
+    for name in names:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.mkdir() if name.endswith("/") else path.touch()
+    assert is_unused(tmp_path)
+    (tmp_path / "parts").mkdir(exist_ok=True)
+    (tmp_path / "parts" / "part-0.parquet").touch()
+    assert not is_unused(tmp_path)
+
+
+def test_a_file_where_the_folder_of_parts_would_be_is_somebody_s(tmp_path):
+    (tmp_path / "parts").touch()
+    assert not is_unused(tmp_path)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"pid": "x"}', '{"pid": 1}', "\x00" * 50])
