@@ -343,15 +343,15 @@ class _Guard:
             return self._below
         self.end_runner()
         context = get_context("fork")
-        self._below, theirs = context.Pipe()
+        below, theirs = context.Pipe()
         self._trace.seek(0)
         self._trace.truncate()
-        inherited = (self._link, self._below)
-        self._runner = context.Process(target=_be_runner, args=(theirs, inherited, self._limits, self._trace.fileno()))
-        self._runner.start()
+        arguments = (theirs, (self._link, below), self._limits, self._trace.fileno())
+        runner = context.Process(target=_be_runner, args=arguments)
+        runner.start()  # an OSError where the system has no more processes
         theirs.close()
-        self._owner, self._answers = task.owner, 0
-        return self._below
+        self._below, self._runner, self._owner, self._answers = below, runner, task.owner, 0
+        return below
 
     def _watch(self, below: Connection) -> End | None:
         """Pass the answers of the runner on until it is done; return its premature end."""

@@ -392,7 +392,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             raise ConfigurationError(f"seed must be a number or a list of {count}, got {len(listed)} seeds")
         first = cast("int | None", seed if listed is None else listed[0])
         super().reset(seed=first)
-        if first is not None and first > 2**63 - count:
+        if listed is None and first is not None and first > 2**63 - count:
             raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
         seeds = self.np_random.integers(SEEDS, size=count) if first is None or listed else first + np.arange(count)
         if listed is not None:
