@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray, as_vector
-from servobench.plant.contract.files import user_path
+from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
@@ -154,11 +154,10 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     path = ur5.shipped_calibration() if path is None else path
     keys = ("x", "y", "z", "roll", "pitch", "yaw")
     wanted = f"the blocks {', '.join(CALIBRATION_BLOCKS)}, each with {', '.join(keys)}"
+    text = read_text("calibration file", path)
     try:
-        blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]
+        blocks = yaml.safe_load(text)["kinematics"]
         table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
-    except OSError as error:
-        raise ValueError(f"calibration file {path} cannot be read: {error.strerror}") from error
     except yaml.YAMLError as error:
         raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
     except KeyError as error:

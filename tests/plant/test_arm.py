@@ -198,7 +198,7 @@ def calibration(**changes):
         (b"", "holds something that is not a number"),
         (b"- 1\n- 2\n", "holds something that is not a number"),
         (b"other: 1\n", "lacks 'kinematics'"),
-        (b"\xff\xfe\xfa\x00", "calibration file"),
+        (b"\xff\xfe\xfa\x00", "is no text in UTF-8; save it in this encoding"),
     ],
 )
 def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
