@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -103,15 +103,14 @@ def init(
     from servobench.harness.config.registry import find_controller, find_plant
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolution import known_sections, resolve_sections
+    from servobench.harness.run.resolution import check_settings, resolve_sections
     from servobench.harness.run.tasks import find_task
 
     split = selection.split
     names = split("plants", plants), split("controllers", controllers), split("tasks", tasks)
     requests = [RunRequest(*each, read_mismatch("none"), 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
-    settings.check_sections([*known_sections(), *names[0], *names[1], *names[2]])
-    settings.check_running(["run", *names[0], *names[1], *names[2]])
+    check_settings(settings, chain.from_iterable(names))
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
     titles = {"run": "common to all plants, controllers and tasks"}
     for (kind, find), each in zip(finds.items(), names, strict=True):

@@ -67,6 +67,15 @@ def test_changed_settings_are_kept_and_their_defaults_told(output_of, tmp_path):
     assert max(map(len, (line for line in lines if line.startswith("#")))) <= 120
 
 
+def test_a_file_of_settings_serves_commands_that_read_a_part_of_it(output_of, tmp_path):
+    path = tmp_path / "bench.toml"
+    output_of("init", path, "--plants", "all", "--controllers", "ukf_mfac,mfac+rls")
+    again = output_of("init", "-", "--plants", "kinematic", "--config", path)
+    assert list(tomllib.loads(again)) == ["run", "kinematic", "ukf_mfac", "exp2"]
+    output_of("fmu", "export", "--controller", "ukf_mfac", "-o", tmp_path / "loop.fmu", "--config", path)
+    assert (tmp_path / "loop.fmu").exists()
+
+
 def test_a_file_that_is_there_is_left_as_it_is(refusal_of, tmp_path):
     path = write(tmp_path, "mine", "bench.toml")
     assert refusal_of("init", path) == f"servobench: {path} exists already and is left as it is; name another file\n"

@@ -258,6 +258,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "-o", "x.fmu", "--mismatch", "outliers=40%"), "is exported without outliers: leave it out"),
     (("fmu", "export", "-o", "x.fmu", "--mismatch", "camera_move=9deg"), "an arm is exported without camera_move"),
     (("init", "-", "--plants", "kinematic", "--set", "bullet.lag=0.2"), "'bullet' does not run here"),
+    (("init", "-", "--config", "bad_value.toml"), "ukf_mpc.law.horizon_time must be above 0, got -1"),
+    (("fmu", "export", "-o", "x.fmu", "--controller", "rls", "--config", "bad_value.toml"), "must be above 0, got"),
     (("new", "controller", "numpy"), "a Python package is called numpy, which a file of this name would hide"),
     (("statistics", "results", "--metric", "seed"), "the table has no column of numbers 'seed'"),
     (("figures", "results", "--names", "A,A,B"), "--names has one name for several controllers: A, A, B"),
