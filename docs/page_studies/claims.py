@@ -77,7 +77,7 @@ CLAIMS = Study(
 CLAIMS_ENGINES = Study(
     "engines",
     "the paper's seven claims on the second physics engine, with as many robots as on the first",
-    15,
+    5,
     {
         division: ("claims", "--plants", SECOND, "--seeds", "10", "--division", division)
         for division in ("equipped", "published")

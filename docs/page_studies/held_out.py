@@ -201,7 +201,7 @@ RENDERED_STUDY = Study(
 TUNING_STUDIES = Study(
     "tuning",
     "200 held-out robots with the values of each of the three tuning studies",
-    10,
+    2,
     {f"study_{k + 1}": with_values_of_study(k) for k in range(len(TITLES))},
     study_tables,
 )

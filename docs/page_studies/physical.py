@@ -182,7 +182,7 @@ ENDS = Study(
 DYNAMICS = Study(
     "dynamics",
     "what each switch of `bullet` and `mujoco` does to each method, and both against `kinematic`",
-    50,
+    30,
     {"kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT)}
     | on_engines(rendered)
     | {

@@ -191,7 +191,7 @@ PAIRS_STUDY = Study(
 SENSING = Study(
     "eyes",
     "every method under every sensing set-up, 200 robots",
-    30,
+    4,
     {"runs": sweep("kinematic", BOTH, "random", "66000:66200", "--sensing", "all")},
     sensing_tables,
 )
