@@ -206,7 +206,8 @@ def _column(tree: Any) -> Expression:  # noqa: ANN401 - any tree
 
 def _where_it_failed(error: BaseException) -> str:
     """Return the innermost function outside of the recorder that an error came through."""
-    found, own = "the code", Path(__file__).parent
+    found = "the code"
+    own = Path(__file__).parent
     for place, _ in walk_tb(error.__traceback__):
         code = place.f_code
         if Path(code.co_filename).parent != own and "servobench" in str(place.f_globals.get("__name__", "")):

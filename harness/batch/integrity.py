@@ -190,7 +190,8 @@ def _parts(folder: Path, manifest: Mapping[str, Any]) -> Iterator[_Part]:
         names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
         names = [name for name in names if results.is_expected(folder, name)]
         rows, count = results.part_name(index, RUNS), 0
-        name, wrong = next(((name, wrong) for name in names if (wrong := _fault(folder, name))), (rows, ""))
+        faults = {name: wrong for name in names if (wrong := _fault(folder, name))}
+        name, wrong = next(iter(faults.items()), (rows, ""))
         if not wrong:
             count = tables.row_count(folder, rows)
             batch, _, first = tables.owner(folder, rows).rpartition("@")

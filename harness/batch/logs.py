@@ -106,7 +106,7 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
 
 
 def _period(path: Path, table: pd.DataFrame) -> float:
-    """Return the control period [s] of a log, the median distance of its rows; refuse rows not so far apart."""
+    """Return the control period [s] of a log, the median distance of its rows; refuse other distances."""
     times = numbers_of(f"log {path}", table, ["time_s"])[:, 0]
     steps = np.diff(times)
     period = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0

@@ -66,7 +66,7 @@ class SourceFile:
         Raises:
             ConfigurationError: it cannot be executed; one line with file and line number.
         """
-        # The same name in every process; other files and other texts have others.
+        # The name follows from path and text, so it is the same in every process.
         place = hashlib.sha256(f"{self.path}\n{self.digest}".encode()).hexdigest()[:12]
         name = f"servobench_file_{self.path.stem}_{place}"
         if name in sys.modules:

@@ -287,7 +287,8 @@ def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
         place = point if counts else place
     if way[-1] == 0.0:  # the arm rests throughout
         return [round(k) for k in np.linspace(0, len(ball) - 1, count)]
-    chosen, order = np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12)), np.arange(count)
+    order = np.arange(count)
+    chosen = np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12))
     apart = np.maximum.accumulate(chosen - order) + order  # where one period takes the ball far
     return [int(k) for k in np.minimum(apart, len(ball) - count + order)]
 

@@ -353,7 +353,8 @@ def _build_controller(run: ResolvedRun, knowledge: RobotKnowledge, true_model: C
 def _check_times(resolved: ResolvedRun, duration: float) -> None:
     """Refuse times that are longer than the run of `duration` [s], so that they never end in it."""
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
-    times, whole = {"run.period": resolved.run.period}, f"the run of {duration:g} s"
+    whole = f"the run of {duration:g} s"
+    times = {"run.period": resolved.run.period}
     times |= {f"{plant}.{name}": getattr(resolved.plant, name, 0.0) for name in ("command_delay", "lag")}
     if isinstance(sensing, SensingConfig):
         names = ("latency", "jitter", "frame_period", "latency_swing")

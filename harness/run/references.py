@@ -125,7 +125,8 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
     Raises:
         ValueError: the file is missing, lacks a column, or holds something that is not a finite number.
     """
-    file, names = f"waypoint file {path}", [f"{name}_{column_unit(feature.unit)}" for name in feature.names]
+    file = f"waypoint file {path}"
+    names = [f"{name}_{column_unit(feature.unit)}" for name in feature.names]
     values = numbers_of(file, read_table("waypoint file", path), ["time_s", *names])
     if values[0, 0] > MAX_BEGIN:
         raise ConfigurationError(f"{file} begins at {values[0, 0]:.0f} s; write time_s from the run's begin on")

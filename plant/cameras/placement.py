@@ -117,7 +117,8 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
 
 def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
     """Refuse a user's camera that cannot be that of a set-up."""
-    name, (on, off) = camera.name, ("flange", "base") if mount == "hand" else ("base", "flange")
+    name = camera.name
+    on, off = ("flange", "base") if mount == "hand" else ("base", "flange")
     if camera.keys.pose.frame == off:
         other = setup.name if mount == "hand" else f"{setup.name}:hand"
         raise ValueError(f"camera {name} is on the {off}; use --sensing {other}")
@@ -187,7 +188,8 @@ def _model(
 ) -> SetupModel:
     work, own = robot.workspace, robot.camera
     home, far = robot.arm.frames(work.home)[-1], work.camera_distance
-    points, side = np.array(setup.target), None if own is None else own.keys.target.side
+    points = np.array(setup.target)
+    side = None if own is None else own.keys.target.side
     shape = work.scale * points if side is None else points * (side / max(np.ptp(points), 1e-9))  # about its middle
     if mount == "fixed":
         distance = setup.closeness * far

@@ -108,7 +108,7 @@ def lane_by_lane(function: Callable[..., Any], signature: str, *arguments: Any) 
     Args:
         function: for single runs.
         signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
-        arguments: of the function, all with the same leading axes, if any.
+        arguments: of the function, all with the same leading axes, if any; the first one is an array.
     """
     if np.ndim(arguments[0]) == signature.partition(")")[0].count(",") + 1:
         return function(*arguments)

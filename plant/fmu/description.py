@@ -177,7 +177,8 @@ def read_exchange(path: Path, root: Path) -> None:
     """
     description = parse_description(path, root)
     version, exchange = str(description.fmiVersion), description.modelExchange
-    wanted, hidden = "wanted FMI 2 with model exchange and directional derivatives", "so its Jacobian cannot be read"
+    wanted = "wanted FMI 2 with model exchange and directional derivatives"
+    hidden = "so its Jacobian cannot be read"
     if not version.startswith("2."):
         raise ValueError(f"fmu file {path} is of FMI {version}, {hidden}; {wanted}")
     if exchange is None:

@@ -48,8 +48,9 @@ def _load(description: FmuDescription) -> ctypes.CDLL:
     """Load the library, or a copy of it where it bears one instance only or an earlier one failed fatally."""
     import fmpy  # noqa: PLC0415 - see parse_description
 
-    root, wanted = description.root, f"{description.identifier}{fmpy.sharedLibraryExtension}"
-    binaries, lacking = root / "binaries", f"fmu file {description.path} has no library for this machine; wanted"
+    root, binaries = description.root, description.root / "binaries"
+    wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
+    lacking = f"fmu file {description.path} has no library for this machine; wanted"
     for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
         file = binaries / folder / wanted
         if file.is_file() and file.resolve().is_relative_to(root.resolve()):

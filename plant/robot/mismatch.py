@@ -195,14 +195,15 @@ def parse_range(name: str, text: str) -> list[float] | list[int]:
 
 
 def _range(name: str, text: str, begin: float, end: float, step: float) -> list[float]:
-    steps, what = (end - begin) / step + 1e-9 if step > 0.0 else -1.0, f"the range {text!r} of {name}"
+    where = f"the range {text!r} of {name}"
+    steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
     if not steps < MAX_MAGNITUDES:
-        raise ValueError(f"{what} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
+        raise ValueError(f"{where} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps")
     if steps < 0.0:  # it begins beyond its end
-        raise ValueError(f"{what} is empty")
+        raise ValueError(f"{where} is empty")
     values = [round(begin + i * step, 9) for i in range(math.floor(steps) + 1)]
     if steps - math.floor(steps) > 1e-6:
-        raise ValueError(f"{what} must be begin:end:step, but its last step ends at {values[-1]:g}")
+        raise ValueError(f"{where} must be begin:end:step, but its last step ends at {values[-1]:g}")
     return values
 
 
