@@ -313,7 +313,7 @@ def save_figure(
     for ending in formats:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
         write_atomically(paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box)))
-        figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
+        figure.set_layout_engine(None)  # freeze the layout: computing it dominates the save
     return paths
 
 
@@ -336,7 +336,7 @@ def box_of(figure: Figure) -> Bbox:
     """Lay a figure out for good; return the box [in] as high as the drawing and as wide as the figure."""
     if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)  # once, also for the edges of the drawing
-        figure.set_layout_engine("none")
+        figure.set_layout_engine(None)  # "none" leaves a placeholder, for which a figure is drawn once more
     drawn = figure.get_tightbbox()
     low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
     return Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
