@@ -33,7 +33,7 @@ from servobench.harness.pictures.style import (
     method_styles,
     save_figure,
 )
-from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, shown_until
+from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, longest, shown_until
 
 FOLDER = "figures"
 LETTERS = 15.0  # of a title in an inch
@@ -137,7 +137,7 @@ class _Plan(NamedTuple):
 
 def _folder_plans(folder: Path, runs: pd.DataFrame, styles: Styles, size: int) -> Iterator[tuple[Group, _Plan]]:
     """Yield the figures of a folder, each with at most `size` tasks, with the group of runs that it shows."""
-    if len(runs):
+    if len(runs) > 1:
         everything = Group("", "", runs, int(runs["seed"].min()), {})
         yield everything, _Plan("conditions", "", (), partial(draw_conditions, split_tasks(runs)[0], styles))
     for group in load_groups(folder, runs):
@@ -174,7 +174,8 @@ def _sample(kind: str, group: Group) -> str:
 
 def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int) -> Iterator[_Plan]:
     """Yield the figures of a group: of its moves, of its curves, and of both."""
-    moves, runs, everything = group.select(point_to_point=True), group.runs, tuple(group.tasks)
+    moves = {task: tracks for task, tracks in group.tasks.items() if longest(tracks).point_to_point}
+    runs, everything = group.runs, tuple(group.tasks)
     until = {task: shown_until(ensembles[task]) for task in everything}
     for text, part in _parts(moves, size):
         yield _Plan("errors", text, part, partial(draw_moves, {task: ensembles[task] for task in part}, styles))
@@ -182,9 +183,10 @@ def _plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, siz
     heads = divisions(name for tracks in moves.values() for name in tracks)
     for text, part in _parts(moves, max(1, size // len(heads))):
         yield _Plan("paths", text, part, partial(draw_paths, {task: moves[task] for task in part}, styles))
-    for task, tracks in group.select(point_to_point=False).items():
-        yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
-        yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
+    for task, tracks in group.tasks.items():
+        if task not in moves:
+            yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
+            yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
     for text, part in _parts(runs["task"].unique() if several else (), size):

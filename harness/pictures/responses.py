@@ -109,7 +109,11 @@ def draw_features(
     for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
         tracks = {name: track.overview() for name, track in whole.items()}
         for axes, feature in zip(column, features, strict=True):
-            draw_feature(axes, tracks, styles, feature)
+            desired = longest(tracks)
+            axes.plot(desired.time, desired.column(f"reference_{feature}"), **DESIRED)
+            for name, track in tracks.items():
+                _draw_values(axes, track, track.column(f"feature_{feature}"), name, styles)
+            axes.set_ylabel(f"measured\n{label_of(feature)}")
         column[0].set_title(task)
         column[-1].set_xlabel("time [s]")
         if until[task] < longest(tracks).time[-1]:
@@ -228,15 +232,6 @@ def draw_over_seeds(
         axes.plot(ensemble.time, shown, label=name, **style.line_arguments(len(shown)))
         if ensemble.mostly_ended:
             mark_end(axes, ensemble.time, shown, style)
-
-
-def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
-    """Draw a feature of one run of each controller as it was measured, and the desired one."""
-    whole = longest(tracks)
-    axes.plot(whole.time, whole.column(f"reference_{feature}"), **DESIRED)
-    for name, track in tracks.items():
-        _draw_values(axes, track, track.column(f"feature_{feature}"), name, styles)
-    axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
 def _draw_feature_error(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:

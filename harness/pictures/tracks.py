@@ -132,11 +132,6 @@ class Group:
     seed: int  # of the runs in `tasks`
     tasks: dict[str, Tracks]  # task -> controller -> track; tasks without any step are left out
 
-    def select(self, *, point_to_point: bool) -> dict[str, Tracks]:
-        """Return the tasks with a fixed target, or those with a moving reference."""
-        moves = {task for task, tracks in self.tasks.items() if longest(tracks).point_to_point}
-        return {task: tracks for task, tracks in self.tasks.items() if (task in moves) == point_to_point}
-
 
 def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     """Yield a group for each plant and mismatch of a folder's table of runs, with the runs of its smallest seed.
@@ -198,27 +193,14 @@ def label_of(feature: str) -> str:
 class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed."""
 
-    runs: pd.DataFrame  # their rows in the table of runs
     time: FloatArray  # instants, (k,) [s]
+    period: float  # of control [s]; NaN of a run of one period
     error: FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
     jacobian_error: FloatArray  # relative, (r, k) [%]; NaN where it is not known
     step_time: FloatArray  # of all steps of the controller, (s,) [µs]
+    settling_time: float  # median [s]; infinite if half of the runs never settled
+    mostly_ended: bool  # whether half of the runs ended early, so that no median goes on to the end
     camera_moved_at: float  # when the camera was moved [s]; NaN where it was not
-
-    @property
-    def period(self) -> float:
-        """Control period [s]; NaN of a run of one period."""
-        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
-
-    @property
-    def settling_time(self) -> float:
-        """Median settling time [s]; infinite if half of the runs never settled."""
-        return float(settling_times(self.runs).fillna(math.inf).median())
-
-    @property
-    def mostly_ended(self) -> bool:
-        """Whether half of the runs ended early, so that no median goes on to the end."""
-        return bool((self.runs["status"] != COMPLETED).mean() >= BAND[1])
 
     @property
     def shown_error(self) -> FloatArray:
@@ -276,10 +258,12 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
     times = np.concatenate([track.column(STEP_TIME) for track in tracks])
     return Ensemble(
         tracks[0].row,
-        runs,
         time,
+        float(time[1] - time[0]) if len(time) > 1 else math.nan,
         np.stack([padded(track.error(), math.nan if track.completed else math.inf) for track in few]),
         np.stack([padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]),
         times[times > 0.0],
+        float(settling_times(runs).fillna(math.inf).median()),
+        bool((runs["status"] != COMPLETED).mean() >= BAND[1]),
         moved_at,
     )
