@@ -344,7 +344,7 @@ def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
     """Return the unit in which a metric of these runs is shown, and the factor to it."""
     metric = METRICS[name]
     if metric.unit:
-        return metric.shown_unit, metric.factor
+        return ("%", 100.0) if metric.percent else (metric.unit, 1.0)
     units = texts_of(runs, "feature_unit").dropna().unique().tolist()
     return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 from servobench.controllers.controller import ControllerEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import listed, override, suggest
+from servobench.plant.contract.settings import override
 
 Config = TypeVar("Config")
 
@@ -57,30 +57,6 @@ class Settings:
         if not _is_section(given) or not all(_is_section(each) for each in self.sections.values()):
             wanted = "sections with keys, such as {'kinematic': {'lag': 0.1}}"
             raise ConfigurationError(f"settings must be {wanted}, got {given!r}")
-
-    def check_sections(self, known: Iterable[str]) -> None:
-        """Refuse sections that nothing would read.
-
-        Raises:
-            ConfigurationError: names the section and the valid ones.
-        """
-        names = set(known)
-        for section in self.sections:
-            if section not in names:
-                raise ConfigurationError(f"unknown section {section!r}: {suggest(section, names)}")
-
-    def check_running(self, running: Iterable[str]) -> None:
-        """Refuse assignments to sections that are not read here.
-
-        Raises:
-            ConfigurationError: names the first of them and the sections that are read.
-        """
-        names = list(running)
-        for section, _, text in self.assigned:
-            if section not in names:
-                found = f"--set {text}: {section!r} does not run here, so this has no effect"
-                remedy = "settings of other runs may stand in a file (--config)"
-                raise ConfigurationError(f"{found}; sections that run: {listed(names)}; {remedy}")
 
     @configuration_errors()
     def resolve(self, section: str, default: Config) -> Config:

@@ -18,7 +18,7 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.knowledge import in_view, network_source, nominal_knowledge
+from servobench.harness.run.knowledge import network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunRequest, RunSettings, find_robot, find_sensing, sensing_file
 from servobench.harness.run.resolution import ResolvedRun, resolve
@@ -114,21 +114,19 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
         raise ConfigurationError(f"task {name}: {why}")
     with configuration_errors(f"task {name}: "):
-        scenario = task.scenario(setting)
-        _check_reference(scenario, len(setting.feature.names))
+        scenario: object = task.scenario(setting)  # of a user's task it may be anything
+        if not isinstance(scenario, Scenario):
+            raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
+        m, times = len(setting.feature.names), np.linspace(0.0, scenario.duration, POINTS)
+        points = np.asarray(scenario.reference.at(times))
+        if points.shape != (POINTS, m) or not np.isfinite(points).all():
+            wanted = f"{m} finite features at each of {POINTS} instants"
+            raise ConfigurationError(
+                f"its reference must be {wanted}, got shape {points.shape} and {points[:1].tolist()}"
+            )
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
-
-
-def _check_reference(scenario: object, m: int) -> None:
-    """Refuse what a user's task returns in place of a scenario, or of `m` finite features at each instant."""
-    if not isinstance(scenario, Scenario):
-        raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
-    points = np.asarray(scenario.reference.at(np.linspace(0.0, scenario.duration, POINTS)))
-    if points.shape != (POINTS, m) or not np.isfinite(points).all():
-        came = f"shape {points.shape} and {points[:1].tolist()}"
-        raise ConfigurationError(f"its reference must be {m} finite features at each of {POINTS} instants, got {came}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +242,7 @@ def _assemble(
             trained = knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
         else:
             nominal = find_sensing(request.sensing).nominal(robot)
-            knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
-            trained = in_view(knowledge, nominal, robot)
+            knowledge, trained = nominal_knowledge(robot, nominal, plant.spec, run)
         source = network_source(trained, progress)
         true_model = plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
         controller = _build_controller(resolved, replace(knowledge, train=source), true_model)

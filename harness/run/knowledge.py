@@ -24,19 +24,21 @@ NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes t
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
-def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
-    """Return the knowledge that every controller gets."""
+def nominal_knowledge(
+    robot: Robot, nominal: RobotModel, spec: PlantSpec, run: RunSettings
+) -> tuple[RobotKnowledge, RobotKnowledge]:
+    """Return the knowledge that every controller gets, and that for training networks.
+
+    The Jacobian of the latter covers postures with the target in view only.
+    """
     if not robot.known:
-        return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
+        knowledge = RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
+        return knowledge, knowledge
     region = robot.workspace.lower, robot.workspace.upper
-    return RobotKnowledge(spec, run.preview_rows, nominal.jacobian, region=region)
-
-
-def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:
-    """Return the knowledge for training networks: its Jacobian covers postures with the target in view only."""
-    if nominal is robot.nominal or not robot.known:
-        return knowledge
-    return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
+    knowledge = RobotKnowledge(spec, run.preview_rows, nominal.jacobian, region=region)
+    if nominal is robot.nominal:
+        return knowledge, knowledge
+    return knowledge, replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
 
 
 @final

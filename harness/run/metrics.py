@@ -86,16 +86,6 @@ class Metric:
     figure: str = ""  # the figure that shows it for each run: settling, effort or smoothness
     summary: Summary | None = None  # its column in the table that a command prints at its end
 
-    @property
-    def shown_unit(self) -> str:
-        """The unit in which it is shown; empty for that of the plant's feature or a handier one."""
-        return "%" if self.percent else self.unit
-
-    @property
-    def factor(self) -> float:
-        """Factor from the column to the unit in which it is shown."""
-        return 100.0 if self.percent else 1.0
-
 
 def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
     """Return the metrics of a run, or of runs side by side.
@@ -191,10 +181,6 @@ def _path_length_ratio(run: Judged) -> FloatArray:
         return np.where(way > 0.0, path_length(run.feature) / way, np.nan)
 
 
-def _steady_state(run: Judged) -> FloatArray:
-    return np.asarray(run.error[..., -max(1, round(FINAL_SPAN / run.period)) :].mean(axis=-1))
-
-
 def _saturation(run: Judged) -> FloatArray:
     at_limit = np.abs(run.command) >= run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
     return np.asarray(at_limit.any(axis=-2).mean(axis=-1))
@@ -251,7 +237,8 @@ _ALL: Final = (
     Metric(
         "steady_state_error", "", "error of the last second", 2,
         "mean of e over the last second",
-        _steady_state, tables={"moves": "Error", "runs": "Error"}, summary=Summary(1, "point_to_point"),
+        lambda run: run.error[..., -max(1, round(FINAL_SPAN / run.period)) :].mean(axis=-1),
+        tables={"moves": "Error", "runs": "Error"}, summary=Summary(1, "point_to_point"),
     ),
     Metric(
         "rms_error", "", "RMS error of the run", 2,

@@ -15,14 +15,12 @@ reach drives joints to their stops, not the other way round. The band of a curve
 """
 
 import math
-from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.log import Steps
-from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import ImageReference, Reference
 from servobench.harness.run.scenario import Scenario
 from servobench.plant.cameras.setups import SetupModel
@@ -92,17 +90,6 @@ def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) ->
         return {}
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
     return {"pose_error_mm": 1e3 * distance, "pose_error_deg": np.degrees(angle)}
-
-
-def final_means(columns: Mapping[str, FloatArray], period: float) -> dict[str, float]:
-    """Return the means of columns (k,) over the last second; none without rows.
-
-    Args:
-        columns: by name.
-        period: of control [s].
-    """
-    rows = max(1, round(FINAL_SPAN / period))
-    return {name: float(values[-rows:].mean()) for name, values in columns.items() if len(values)}
 
 
 def pose_error(points: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import override
+from servobench.plant.contract.settings import listed, override, suggest
 from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin
@@ -175,16 +175,18 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
     """
     names = ["run", *dict.fromkeys(running)]
     pairs = [section for section in settings.sections if "+" in section and not is_foreign_controller(section)]
-    settings.check_sections([*known_sections(), *pairs, *names])
-    settings.check_running(names)
+    known = {*plant_names(), *controller_names(), *task_names(), *pairs, *names}
+    for section in settings.sections:
+        if section not in known:
+            raise ConfigurationError(f"unknown section {section!r}: {suggest(section, known)}")
+    for section, _, text in settings.assigned:
+        if section not in names:
+            found = f"--set {text}: {section!r} does not run here, so this has no effect"
+            remedy = "settings of other runs may stand in a file (--config)"
+            raise ConfigurationError(f"{found}; sections that run: {listed(names)}; {remedy}")
     for section in settings.sections:
         if section not in names and (default := _default(section)) is not None:
             settings.resolve(section, default)
-
-
-def known_sections() -> list[str]:
-    """Return every section that a configuration may have, but for those of pairs and of mapped FMUs."""
-    return ["run", *plant_names(), *controller_names(), *task_names()]
 
 
 def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
