@@ -68,11 +68,6 @@ class Timing:
         """Return whether a frame is exposed after sub-step number `step`."""
         return step % self.frames == self.phase
 
-    def under_way(self) -> list[int]:
-        """Return the sub-steps, above 0, at which the frames are due that were exposed before the start."""
-        begins = range(1 - self.latency, 1)
-        return [begin + self.latency for begin in begins if self.exposes(begin)]
-
 
 def delays_of(command_delay: float, sensing: SensingConfig) -> dict[str, float]:
     """Return the times [s] that a bench adds to a world, by the name of the setting."""
@@ -201,7 +196,9 @@ class Bench(Plant):
         rest = np.zeros(self._shape)
         rest.setflags(write=False)
         self._commands = deque([rest] * self._timing.delays[0])
-        self._frames = deque(Frame(due, first, self._all_valid) for due in self._timing.under_way())
+        latency = self._timing.latency
+        exposed = filter(self._timing.exposes, range(1 - latency, 1))  # before the start, and due after it
+        self._frames = deque(Frame(step + latency, first, self._all_valid) for step in exposed)
         self._held, self._k, self._camera = first, 0, self._first_camera
         return self._observation(joints, first, self._all_valid)
 

@@ -70,16 +70,13 @@ class Sensing:
         Raises:
             ValueError: the arm has too few joints, or the mismatch names an axis that the cameras do not have.
         """
-        self._check(mismatch)
-        if self._is_plain(robot):
-            return true, None
-        draws = draw_cameras(mismatch, self.setup.cameras, seed)
-        turn = sample.camera_angle * sample.camera_axis
-        return true_model(self.setup, self.mount, robot, true.arm, turn, draws), draws
-
-    def _check(self, mismatch: Mismatch) -> None:
         for axis, _ in mismatch.axes:
             if axis in OPTICAL and self.setup.name == POSITION.name:
                 raise ValueError(f"mismatch axis {axis} needs a camera that sees pixels, such as --sensing pixel")
             if axis == ON_HAND and self.mount != HAND:
                 raise ValueError(f"mismatch axis {axis} needs a camera on the hand, such as --sensing pixel:{HAND}")
+        if self._is_plain(robot):
+            return true, None
+        draws = draw_cameras(mismatch, self.setup.cameras, seed)
+        turn = sample.camera_angle * sample.camera_axis
+        return true_model(self.setup, self.mount, robot, true.arm, turn, draws), draws

@@ -139,12 +139,18 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     interface = description.coSimulation or description.modelExchange
     if interface is None:
         raise ValueError(f"fmu file {path} offers scheduled execution only; wanted co-simulation or model exchange")
+    identifier = str(interface.modelIdentifier)
+    if not IDENTIFIER.fullmatch(identifier):
+        raise ValueError(
+            f"fmu file {path} has the modelIdentifier {_line(repr(identifier))}, which is no name of a library: "
+            "wanted letters, digits and '_', without folders"
+        )
     return FmuDescription(
         path=path,
         root=root,
         version=int(version[0]),
         model_name=str(description.modelName),
-        identifier=_identifier(interface, path),
+        identifier=identifier,
         token=str(description.guid if version.startswith("2") else description.instantiationToken),
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
@@ -212,17 +218,6 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
 def _line(words: object) -> str:
     """Return text of a foreign file as one line of limited length."""
     return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
-
-
-def _identifier(interface: Any, path: Path) -> str:  # noqa: ANN401 - fmpy's interfaces carry no usable types
-    """Return the name of the library, which may not lead out of its folder."""
-    identifier = str(interface.modelIdentifier)
-    if not IDENTIFIER.fullmatch(identifier):
-        raise ValueError(
-            f"fmu file {path} has the modelIdentifier {_line(repr(identifier))}, which is no name of a library: "
-            "wanted letters, digits and '_', without folders"
-        )
-    return identifier
 
 
 def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's variables carry no usable types

@@ -85,7 +85,7 @@ class Instance(ABC):
         self.description, self.tolerance, self._debugs = description, tolerance, debug_log is not None
         self.log = MessageLog(description.path.name, debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
-        self._library = Library(description)
+        self.library = Library(description)
         self._component = ctypes.c_void_p()
         self._states: list[ctypes.c_void_p] = []  # handles of saved states, freed with the instance
         try:
@@ -101,15 +101,11 @@ class Instance(ABC):
     def _instantiate(self) -> int | None:
         """Make an instance and return its address."""
 
-    @property
-    def fatal(self) -> bool:
-        """Whether it, or another instance of its library, reported a fatal error, after which nothing may be called."""
-        return self._library.condemned
-
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
         self._initialise(time)
-        self._integrator = Integrator(self)
+        if self.description.exchange:
+            self._integrator = Integrator(self)
         self._begun = True
 
     @abstractmethod
@@ -294,7 +290,7 @@ class Instance(ABC):
 
     def close(self) -> None:
         """End and free the instance with its saved states and unload its library; calling it twice is allowed."""
-        if self._component.value and not self.fatal:
+        if self._component.value and not self.library.condemned:
             for state in self._states:
                 self._free(state)
             if self._begun:
@@ -304,7 +300,7 @@ class Instance(ABC):
             release.restype = None
             release(self._component)
         self._component, self._begun = ctypes.c_void_p(), False
-        self._library.unload()
+        self.library.unload()
 
     def check(self, function: str, status: int) -> None:
         """Raise unless `status` is good.
@@ -315,12 +311,12 @@ class Instance(ABC):
         if status > WARNING or status < OK:
             self._begun = False  # After an error an instance may only be freed.
             if status == FATAL:
-                self._library.condemn()
+                self.library.condemn()
             raise self.log.failure(function, status)
 
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
         """Call a function of the library on the instance and check its status; not for the inner loop."""
-        if self.fatal:
+        if self.library.condemned:
             raise FmuError(f"{self.description.path.name} reported a fatal error before, so it cannot be called again")
         self.check(f"{self.prefix}{name}", self.function(name)(self._component, *arguments))
 
@@ -331,7 +327,7 @@ class Instance(ABC):
             ValueError: the library does not have it.
         """
         try:
-            return getattr(self._library.loaded, f"{self.prefix}{name}")
+            return getattr(self.library.loaded, f"{self.prefix}{name}")
         except AttributeError as error:
             file = self.description.path.name
             raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error

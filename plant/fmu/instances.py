@@ -95,7 +95,7 @@ class Instances:
 
     def drop(self, i: int, fault: FmuError) -> None:
         """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
-        for j in range(len(self.lanes)) if self.lanes[i].instance.fatal else (i,):
+        for j in range(len(self.lanes)) if self.lanes[i].instance.library.condemned else (i,):
             if self.live[j] is self.lanes[j]:
                 self._fail(j, fault)
                 self.live[j] = self.lanes[j].resting()

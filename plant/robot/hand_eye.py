@@ -10,7 +10,7 @@ The robots of many runs side by side are one model, whose arrays have leading ax
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import ClassVar, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -150,6 +150,7 @@ class HandEyeModel(RobotModel):
 
     arm: SerialArm  # the arm with the ball on its flange
     X_BC: FloatArray  # (..., 4, 4), camera in the base frame; z along the optical axis, x right and y down in the image
+    channel: ClassVar[Channel] = FEATURE  # names, unit and natural size of the ball's coordinates
 
     def __post_init__(self) -> None:
         """Check that the camera pose is a rigid transform and freeze it."""
@@ -159,11 +160,6 @@ class HandEyeModel(RobotModel):
         if deviation > ROTATION_TOLERANCE or (np.linalg.det(R) < 0.0).any():
             raise ValueError("X_BC must hold a rotation matrix")
         object.__setattr__(self, "X_BC", pose)
-
-    @property
-    def channel(self) -> Channel:
-        """Names, unit and natural size of the ball's coordinates."""
-        return FEATURE
 
     @property
     def camera(self) -> FloatArray:

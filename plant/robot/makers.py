@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import as_vector
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh
@@ -27,6 +27,7 @@ from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, 
 
 Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+ALIKE: Final = (2, 1, 3)  # joints of shoulder, elbow and wrist that share a number of a `Triple`
 UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
 PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
 
@@ -60,19 +61,20 @@ UNIVERSAL_ROBOTS: Final = {title: UniversalRobot(**row) for title, row in ur5.AR
 def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
     row = UNIVERSAL_ROBOTS[title]
+    limits = JointLimits(np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(np.repeat(row.speed, ALIKE)))
     if title == "UR5":
-        return _ur5(row)
-    arm, limits = with_ball(row.arm()), _ur_limits(row)
+        return _ur5(row, limits)
+    arm = with_ball(row.arm())
     scale = length_scale(arm)
     radius, aside = scale * np.array(ur5.TUBE_RADIUS), scale * np.array(ur5.SIDE_STEP)
     mass = np.array(row.mass)
-    inertia, torque = cylinder_inertia(mass, radius, arm), _by_joint(row.torque)
+    inertia, torque = cylinder_inertia(mass, radius, arm), np.repeat(row.torque, ALIKE)
     links = Links(mass, np.array(row.centre), inertia, torque, radius, aside, row.payload)
     workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
     return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
 
 
-def _ur5(row: UniversalRobot) -> Robot:
+def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
     """Return the UR5, with the workspace of its sheet."""
     bodies = ur5.MASS, ur5.CENTRE_OF_MASS, ur5.INERTIA, ur5.MAX_TORQUE, ur5.TUBE_RADIUS, ur5.SIDE_STEP
     mass, middle, inertia, torque, radius, aside = map(np.array, bodies)
@@ -81,15 +83,7 @@ def _ur5(row: UniversalRobot) -> Robot:
     centre, shoulder, home, lower, upper, stretched = map(np.array, places)
     moves = {name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()}
     workspace = Workspace(1.0, centre, shoulder, home, lower, upper, moves, stretched)
-    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), _ur_limits(row), links, workspace)
-
-
-def _by_joint(values: Triple) -> FloatArray:
-    return np.repeat(values, (2, 1, 3))
-
-
-def _ur_limits(row: UniversalRobot) -> JointLimits:
-    return JointLimits(np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(_by_joint(row.speed)))
+    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
 
 
 @cache
