@@ -19,7 +19,6 @@ from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.catalogue import WITH
-from servobench.plant.robot.mismatch import Mismatch
 
 PACKAGES = (
     "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",
@@ -132,7 +131,7 @@ def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]]) -> Iter
     yield from (name.partition(WITH)[0].partition("#")[0] for name in runs.robots)
     for camera in (find_robot(name).camera for name in runs.robots):
         yield from () if camera is None else map(str, camera.files)
-    yield from filter(None, (Mismatch.parse(text).calibration for text in runs.mismatches))
+    yield from filter(None, (each.mismatch.calibration for each in runs.examples))
     for values in configuration.values():
         yield from (str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value)
     for name in (*runs.plants, *runs.controllers):

@@ -128,16 +128,13 @@ class ConsoleObserver(Observer):
         self.done, self.total = done, total
         self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
         self._bar = self._bars.begin("running", total, done)
-        self._end()
+        if done == total:
+            self.close()
 
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
         self.done += len(rows)
         self._bars.reach(self._bar, self.done, f"{self.done} of {self.total} runs")
-        self._end()
-
-    def _end(self) -> None:
-        """Take the bar away after the last run."""
         if self.done == self.total:
             self.close()
 

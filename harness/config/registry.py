@@ -263,14 +263,15 @@ def _rename(own: Offer) -> str:
 def engine_of(name: str) -> str:
     """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
     try:
-        return _told(find_plant(name))
+        entry = find_plant(name)
+        return "" if entry.engine is None else _told(entry.engine)
     except (ConfigurationError, ImportError):
         return ""
 
 
 @cache
-def _told(entry: PlantEntry) -> str:
-    return entry.engine() if entry.engine is not None else ""
+def _told(engine: Callable[[], str]) -> str:
+    return engine()
 
 
 def default_plant() -> tuple[str, str]:

@@ -163,16 +163,12 @@ def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: Met
     axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
     axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
               markerfacecolor=style.face)  # fmt: skip
-    words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
+    shown = [f"{1e3 * time:.0f} µs" if time < 0.9995 else f"{time:.3g} ms" for time in (middle, high, values.max())]
+    words = ", ".join(shown)
     if values.max() > limit:
         axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
         words += f"\n{np.count_nonzero(values > limit)} of {len(values)} too slow"
     return words
-
-
-def _short(milliseconds: float) -> str:
-    """Return a time with its unit and at most three digits."""
-    return f"{1000.0 * milliseconds:.0f} µs" if milliseconds < 0.9995 else f"{milliseconds:.3g} ms"
 
 
 def _label(column: str, runs: pd.DataFrame) -> str:

@@ -271,14 +271,23 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
 
 
 def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
-    """Refuse a start or a target that no true robot of the run's mismatch can reach.
+    """Refuse a start, or a target taught at joint positions, outside the joints' limits, and a target out of reach.
 
     Raises:
-        ConfigurationError: names it, and how far it is out of reach.
+        ConfigurationError: names it and the joint, or how far it is out of reach of any true robot.
     """
-    if experiment.drawn.true is not None:
-        _check_joints(run, experiment.scenario, experiment.plant.spec)
-        _check_reach(run, experiment.scenario, experiment.plant.spec)
+    scenario, spec = experiment.scenario, experiment.plant.spec
+    if experiment.drawn.true is None:
+        return
+    for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
+        if values is None:
+            continue
+        rows = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
+        for joint, value, lower, upper in rows:
+            if not lower <= value <= upper:
+                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
+                raise ConfigurationError(f"task {run.request.task}: {what} must be {wanted}, got {value:g}")
+    _check_reach(run, scenario, spec)
 
 
 def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
@@ -416,18 +425,6 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
         found = f"{what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's reach"
         remedy = f"for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
         raise ConfigurationError(f"task {task}: {found}; {remedy}")
-
-
-def _check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
-    """Refuse a start, or a target taught at joint positions, outside the joints' limits."""
-    for what, values in (("start", scenario.start), ("target", resolved.task.taught_at)):
-        if values is None:
-            continue
-        rows = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
-        for joint, value, lower, upper in rows:
-            if not lower <= value <= upper:
-                wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
-                raise ConfigurationError(f"task {resolved.request.task}: {what} must be {wanted}, got {value:g}")
 
 
 @lru_cache(maxsize=64)
