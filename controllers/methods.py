@@ -95,13 +95,6 @@ LAWS: dict[str, Part[Law[Any]]] = {
 PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
 
 
-def _find(kind: str, name: str, parts: Mapping[str, Part[Kind]]) -> Part[Kind]:
-    if name not in parts:
-        hint = did_you_mean(name, parts)
-        raise ValueError(f"{kind} must be one of {', '.join(sorted(parts))}, got {name!r}{hint}")
-    return parts[name]
-
-
 @dataclass(frozen=True)
 class MethodConfig:
     """Settings of a composed controller."""
@@ -179,7 +172,11 @@ class Method:
         return ControllerEntry(self.name, self.summary, self.config, self.build, needs_truth, side_by_side=True)
 
     def _parts(self) -> tuple[Part[Any], Part[Any]]:
-        return _find("law", self.law, LAWS), _find("estimator", self.estimator, ESTIMATORS)
+        for kind, name, known in (("law", self.law, list(LAWS)), ("estimator", self.estimator, list(ESTIMATORS))):
+            if name not in known:
+                hint = did_you_mean(name, known)
+                raise ValueError(f"{kind} must be one of {', '.join(sorted(known))}, got {name!r}{hint}")
+        return LAWS[self.law], ESTIMATORS[self.estimator]
 
 
 _OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # which it brings itself

@@ -24,7 +24,6 @@ from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.catalogue import WITH
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.robot.robot import Robot
 
 DEFAULT_ROBOT: Final = ur5.UR5
 OWN_ROBOT: Final = "own"  # in the column `robot`: the plant brings it
@@ -229,14 +228,7 @@ def read_seed(seed: object) -> int:
     return operator.index(seed)
 
 
-@configuration_errors()
-def find_robot(name: str) -> Robot:
-    """Return the robot that a name or the path of a file stands for.
-
-    Raises:
-        ConfigurationError: an unknown name, or a file that cannot be used.
-    """
-    return catalogue.find_robot(name)
+find_robot = configuration_errors()(catalogue.find_robot)  # a ConfigurationError for a name that cannot be used
 
 
 def with_camera(robot: str, camera: Path) -> str:
