@@ -19,12 +19,31 @@ class Library:
     """An instance's access to the library of its FMU, which the operating system loads once for all instances."""
 
     def __init__(self, description: FmuDescription) -> None:
-        """Load the library for this machine.
+        """Load the library, or a copy of it where it bears one instance only or an earlier one failed fatally.
 
         Raises:
-            ValueError: there is none, or it cannot be loaded.
+            ValueError: there is none for this machine, or it cannot be loaded.
         """
-        self.loaded: Any = _load(description)  # None after `unload`
+        import fmpy  # noqa: PLC0415 - see parse_description
+
+        self.loaded: Any = None  # as after `unload`
+        root, binaries = description.root, description.root / "binaries"
+        wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
+        lacking = f"fmu file {description.path} has no library for this machine; wanted"
+        for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
+            file = binaries / folder / wanted
+            if file.is_file() and file.resolve().is_relative_to(root.resolve()):
+                try:
+                    library = None if description.once_per_process else ctypes.CDLL(str(file))
+                    self.loaded = _load_copy(file) if library is None or library._handle in _fatal else library
+                except OSError as error:
+                    raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
+                return
+            if file.parent.is_dir():
+                there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
+                raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
+        there = ", ".join(sorted(folder.name for folder in binaries.iterdir())) if binaries.is_dir() else ""
+        raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
 
     @property
     def condemned(self) -> bool:
@@ -42,28 +61,6 @@ class Library:
         if self.loaded is not None and not self.condemned:
             freeLibrary(self.loaded._handle)
         self.loaded = None
-
-
-def _load(description: FmuDescription) -> ctypes.CDLL:
-    """Load the library, or a copy of it where it bears one instance only or an earlier one failed fatally."""
-    import fmpy  # noqa: PLC0415 - see parse_description
-
-    root, binaries = description.root, description.root / "binaries"
-    wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
-    lacking = f"fmu file {description.path} has no library for this machine; wanted"
-    for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
-        file = binaries / folder / wanted
-        if file.is_file() and file.resolve().is_relative_to(root.resolve()):
-            try:
-                library = None if description.once_per_process else ctypes.CDLL(str(file))
-                return _load_copy(file) if library is None or library._handle in _fatal else library
-            except OSError as error:
-                raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
-        if file.parent.is_dir():
-            there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
-            raise ValueError(f"{lacking} binaries/{folder}/{wanted}, it has there: {there}")
-    there = ", ".join(sorted(folder.name for folder in binaries.iterdir())) if binaries.is_dir() else ""
-    raise ValueError(f"{lacking} {fmpy.platform_tuple}, it has: {there or 'none'}")
 
 
 def _load_copy(file: Path) -> ctypes.CDLL:
