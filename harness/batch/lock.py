@@ -38,8 +38,12 @@ class Holder:
     @classmethod
     def this_process(cls) -> Self:
         """Return the entry of this process in a lock."""
+        try:
+            owner = getpass.getuser()
+        except (OSError, KeyError):  # a user without a name, as in a container
+            owner = f"user {os.getuid()}"
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        return cls(_user(), platform.node(), os.getpid(), now, _start_of(os.getpid()))
+        return cls(owner, platform.node(), os.getpid(), now, _start_of(os.getpid()))
 
     @classmethod
     def read(cls, file: Path) -> Self | None:
@@ -146,13 +150,6 @@ def _same(path: Path, descriptor: int) -> bool:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except OSError:
         return False
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # a user without a name, as in a container
-        return f"user {os.getuid()}"
 
 
 def _start_of(pid: int) -> str:

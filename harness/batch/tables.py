@@ -227,19 +227,15 @@ def lacking(kind: str, schema: pa.Schema) -> str:
     """Return which columns a table of runs or steps lacks, or has of another type, as a predicate; empty if none."""
     if missing := [name for name in NEEDED[kind] if name not in schema.names]:
         return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}"
-    return next(filter(None, (_mistyped(kind, each.name, each.type) for each in schema)), "")
-
-
-def _mistyped(kind: str, name: str, given: pa.DataType) -> str:
-    """Return that a column is of another type than it should be, as a predicate; empty if it is not."""
-    is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
-    is_whole, is_truth = pa.types.is_integer(given), pa.types.is_boolean(given) and name not in NUMBERS
-    is_number = is_whole or is_truth or (pa.types.is_floating(given) and name not in WHOLE)
-    text, number = name in TEXTS, name in NUMBERS or (kind == "steps" and name != "run_id")
-    if pa.types.is_null(given) or (is_text and not number) or (is_number and not text):
-        return ""
-    wanted = "texts" if text else "whole numbers" if name in WHOLE else "numbers"
-    return f"has {given} in the column {name}, where {wanted} belong"
+    for name, given in zip(schema.names, schema.types, strict=True):
+        is_text = pa.types.is_string(given) or pa.types.is_large_string(given)
+        is_whole, is_truth = pa.types.is_integer(given), pa.types.is_boolean(given) and name not in NUMBERS
+        is_number = is_whole or is_truth or (pa.types.is_floating(given) and name not in WHOLE)
+        text, number = name in TEXTS, name in NUMBERS or (kind == "steps" and name != "run_id")
+        if not (pa.types.is_null(given) or (is_text and not number) or (is_number and not text)):
+            wanted = "texts" if text else "whole numbers" if name in WHOLE else "numbers"
+            return f"has {given} in the column {name}, where {wanted} belong"
+    return ""
 
 
 def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 from servobench.harness.batch.processes import FOREIGN_TIME, Bounds
 from servobench.harness.batch.sandbox import LOST, Tell, call
 from servobench.harness.check.report import Finding
-from servobench.harness.config.registry import MAPPED, REGISTRIES, Registry, find_controller, installed_plant
+from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import PLACE, count_as_users, place_in_trace
 from servobench.harness.run.experiment import build
@@ -133,7 +133,10 @@ def choose(word: Word, given: str) -> str:
         ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
     registry = REGISTRIES[word]
-    if _is_foreign(registry, given):
+    place = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
+    if place is not None and place["module"]:
+        count_as_users(place["module"])
+    if place is not None or registry.published(given) is not None:
         _, failure = attempt(_choose, word, given, limit=IMPORT_LIMIT)
         if failure:
             raise ConfigurationError(f"{given} cannot be imported: {failure}")
@@ -142,16 +145,6 @@ def choose(word: Word, given: str) -> str:
 
 def _choose(word: Word, given: str) -> str:
     return REGISTRIES[word].choose(given)
-
-
-def _is_foreign(registry: Registry[Any], given: str) -> bool:
-    """Return whether a text names code that is not of this package; an unknown name does not."""
-    if registry.published(given) is not None:
-        return True
-    found = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
-    if found is not None and found["module"]:
-        count_as_users(found["module"])
-    return found is not None
 
 
 def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
