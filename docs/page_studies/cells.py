@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import pandas as pd
 
@@ -28,8 +28,9 @@ from servobench.harness.analysis.comparison import (
 )
 from servobench.harness.run.result import COMPLETED
 
+Cell: TypeAlias = Callable[[pd.DataFrame], str]  # what a table says of runs
 TAIL: Final = 0.95
-CHANGED: Final = ("changed", "usual")  # a pair: a method with one thing changed, and as it is
+CHANGED: Final = " changed"  # end of the name of a method with one thing changed, beside the method as it is
 
 
 def by_method(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -38,12 +39,15 @@ def by_method(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield str(name), own
 
 
-def rows_by_method(
-    runs: pd.DataFrame, cells: Mapping[str, Callable[[pd.DataFrame], str]], title: str = "method"
-) -> Iterator[dict[str, str]]:
+def rows_by_method(runs: pd.DataFrame, cells: Mapping[str, Cell], title: str = "method") -> Iterator[dict[str, str]]:
     """Yield a row for each method, of its name and of what each of `cells` says of its runs."""
     for name, own in by_method(runs):
         yield {title: quoted(name)} | {heading: cell(own) for heading, cell in cells.items()}
+
+
+def where(column: str, value: str, cell: Cell) -> Cell:
+    """Return a cell of those runs alone that have a value in a column."""
+    return lambda runs: cell(runs[runs[column] == value])
 
 
 def quoted(name: str) -> str:
@@ -60,9 +64,9 @@ def short(estimate: Estimate, digits: int) -> str:
     return f"{estimate:.{digits}f}".replace("inf", "∞")
 
 
-def settled(runs: pd.DataFrame) -> int:
+def settled(runs: pd.DataFrame) -> str:
     """Return how many runs settled."""
-    return int(settling_times(runs).notna().sum())
+    return str(settling_times(runs).notna().sum())
 
 
 def settling(runs: pd.DataFrame, digits: int = 2) -> str:
@@ -139,6 +143,10 @@ class Measure:
         own, keys = runs[runs["task"] == self.task], ("plant", "task", "seed")
         return compare_pairs(own, pairs, metric=self.metric, keys=keys)
 
+    def differences(self, runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> list[str]:
+        """Return the text on the paired difference of each pair of names."""
+        return [self.difference(found) for found in self.compare(runs, pairs)]
+
     def difference(self, found: Difference) -> str:
         """Return the lost runs of both if there are any, the mean difference with its interval, and the verdict."""
         lost = "{} : {} lost, ".format(*found.lost) if any(found.lost) else ""
@@ -174,10 +182,9 @@ MOVES: Final = Measure("random", "settling_time_s", digits=2, factor=1.0)
 CIRCLES: Final = Measure("circle", "rms_error_evaluated", digits=1, factor=1e3)  # [m], shown in mm
 
 
-def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Return the runs of a method under the two names of `CHANGED`."""
-    both = zip(CHANGED, (changed, usual), strict=True)
-    return pd.concat(runs[runs["controller"] == name].assign(controller=label, plant="") for label, runs in both)
+def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs of methods with one thing changed, whose names end with `CHANGED`, and of methods as they are."""
+    return pd.concat([changed.assign(controller=changed["controller"] + CHANGED), usual]).assign(plant="")
 
 
 def side(estimate: Estimate) -> int:

@@ -54,12 +54,10 @@ def tables(folder: Path) -> dict[str, pd.DataFrame]:
     again = {title: load_runs(folder / part_of(title)) for title in CHANGES} if runs["failed"].any() else {}
     changed = []
     for method, own in by_method(runs):
-        seeds = set(own.loc[own["failed"], "seed"])
-        repeats = {
-            title: each[(each["controller"] == method) & each["seed"].isin(seeds)] for title, each in again.items()
-        }
-        if seeds:
-            counts = {title: str(settled(each)) for title, each in repeats.items()}
+        seeds = own.loc[own["failed"], "seed"]
+        same = {title: each[(each["controller"] == method) & each["seed"].isin(seeds)] for title, each in again.items()}
+        if len(seeds):
+            counts = {title: settled(each) for title, each in same.items()}
             changed.append({FAILED: f"{quoted(method)}, of {len(seeds)}"} | counts)
     return {
         "failures": pd.DataFrame(rows_by_method(runs, RATES)),

@@ -10,28 +10,15 @@ from typing import Any, Final
 
 import pandas as pd
 
-from page_studies import cells
-from page_studies.study import (
-    BETTER,
-    BOTH,
-    ENGINES,
-    FIVE,
-    PUBLISHED,
-    RENDERED,
-    SUFFIX,
-    Study,
-    Words,
-    on_engines,
-    settings,
-    sweep,
-)
+from page_studies import cells, study
+from page_studies.cells import CHANGED, CIRCLES, MOVES, Cell, quoted, rows_by_method, where
+from page_studies.study import BETTER, BOTH, ENGINES, FIVE, PUBLISHED, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import default_config, tuned_file
 
-Cell = Callable[[pd.DataFrame], str]
 PAIRS: Final = [(BETTER, name) for name in BOTH if name != BETTER] + [
     (name.removesuffix(SUFFIX), name) for name in PUBLISHED
 ]
@@ -42,18 +29,13 @@ LESS: Final[Mapping[str, Any]] = {aid: getattr(AidsConfig(), aid) for aid in SWI
 """The value of each aid that leaves it out."""
 
 
-def of(measure: cells.Measure, cell: Cell) -> Cell:
-    """Return a cell of the runs of one task."""
-    return lambda runs: cell(runs[runs["task"] == measure.task])
-
-
 METHOD_CELLS: Final[Mapping[str, Cell]] = {
     "division": lambda runs: "as published" if runs["controller"].iloc[0].endswith(SUFFIX) else "best equipped",
-    "settled, %": of(cells.MOVES, cells.share),
-    "settling time, s": of(cells.MOVES, cells.settling),
-    "overshoot, %": of(cells.MOVES, cells.overshoot),
-    "worst 5 % of final errors, mm": of(cells.MOVES, cells.worst_errors),
-    "circle, RMS of the second lap, mm": of(cells.CIRCLES, cells.millimetres),
+    "settled, %": where("task", "random", cells.share),
+    "settling time, s": where("task", "random", cells.settling),
+    "overshoot, %": where("task", "random", cells.overshoot),
+    "worst 5 % of final errors, mm": where("task", "random", cells.worst_errors),
+    "circle, RMS of the second lap, mm": where("task", "circle", cells.millimetres),
 }
 HEADLINE_CELLS: Final[Mapping[str, Cell]] = {
     "settled, %": METHOD_CELLS["settled, %"],
@@ -64,14 +46,14 @@ HEADLINE_CELLS: Final[Mapping[str, Cell]] = {
 
 def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield a row for each method from its moves and circles."""
-    for row in cells.rows_by_method(runs, METHOD_CELLS):
+    for row in rows_by_method(runs, METHOD_CELLS):
         yield row | {"method": row["method"].replace(SUFFIX, "")}
 
 
 def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield a row for the better method and each of the paper's, both divisions beside each other."""
     for name in FIVE:
-        row = {"method": cells.quoted(name)}
+        row = {"method": quoted(name)}
         for full, words in ((name, ""), (name + SUFFIX, "as published: ")):
             own = runs[runs["controller"] == full]
             row |= {words + title: cell(own) if len(own) else MISSING for title, cell in HEADLINE_CELLS.items()}
@@ -81,21 +63,21 @@ def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
 def tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the headline, all methods, and their paired differences."""
     both = pd.concat([load_runs(folder / part) for part in HELD_OUT.commands], ignore_index=True)
-    pair_rows = [
-        {
-            "pair": f"{cells.quoted(pair[0])} − {cells.quoted(pair[1])}",
-            "settling time, s": cells.MOVES.difference(move),
-            "circle, mm": cells.CIRCLES.difference(circle),
-        }
-        for pair, move, circle in zip(
-            PAIRS, *(each.compare(both, PAIRS) for each in (cells.MOVES, cells.CIRCLES)), strict=True
-        )
-    ]
+    pairs = {
+        "pair": map(minus, PAIRS),
+        "settling time, s": MOVES.differences(both, PAIRS),
+        "circle, mm": CIRCLES.differences(both, PAIRS),
+    }
     return {
         "headline": pd.DataFrame(headline_rows(both)),
         "held_out": pd.DataFrame(method_rows(both)),
-        "held_out_pairs": pd.DataFrame(pair_rows),
+        "held_out_pairs": pd.DataFrame(pairs),
     }
+
+
+def minus(pair: tuple[str, str]) -> str:
+    """Return a pair of methods as a page shows their difference."""
+    return f"{quoted(pair[0])} − {quoted(pair[1])}"
 
 
 def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
@@ -109,12 +91,10 @@ def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
     ]
     pairs = [pair for pair in PAIRS if set(pair) <= set(RENDERED)]
     differences = [
-        {"pair": f"{cells.quoted(first)} − {cells.quoted(second)}"}
-        | {f"settling time on `{engine}`, s": move[engine] for engine in ENGINES}
-        | {f"circle on `{engine}`, mm": circle[engine] for engine in ENGINES}
-        for (first, second), move, circle in zip(
-            pairs, cells.MOVES.on_engines(runs, pairs), cells.CIRCLES.on_engines(runs, pairs), strict=True
-        )
+        {"pair": minus(pair)}
+        | {f"settling time on `{engine}`, s": cell for engine, cell in move.items()}
+        | {f"circle on `{engine}`, mm": cell for engine, cell in circle.items()}
+        for pair, move, circle in zip(pairs, *(each.on_engines(runs, pairs) for each in (MOVES, CIRCLES)), strict=True)
     ]
     return {"held_out_rendered": pd.DataFrame(beside), "held_out_engines": pd.DataFrame(differences)}
 
@@ -126,7 +106,7 @@ def study_tables(folder: Path) -> dict[str, pd.DataFrame]:
     for name in BOTH:
         own = [part[part["controller"] == name] for part in parts]
         if any(len(each) for each in own):
-            rows.append({"method": cells.quoted(name)} | dict(zip(TITLES, map(cells.settling, own), strict=False)))
+            rows.append({"method": quoted(name)} | dict(zip(TITLES, map(cells.settling, own), strict=False)))
     return {"held_out_studies": pd.DataFrame(rows, columns=["method", *TITLES])}
 
 
@@ -169,18 +149,12 @@ def aids_tables(folder: Path) -> dict[str, pd.DataFrame]:
     usual = load_runs(folder / USUAL)
     rows: dict[str, list[dict[str, str]]] = {"aids": [], "aids_circle": []}
     for aid in LESS:
-        changed = load_runs(folder / aid)
-        both = {name: cells.changed_and_usual(changed, usual, name) for name in FIVE}
-        for table, measure in zip(rows.values(), (cells.MOVES, cells.CIRCLES), strict=True):
-            table.append(
-                {"left out": cells.quoted(aid)}
-                | {
-                    cells.quoted(name): measure.difference(measure.compare(own, [cells.CHANGED])[0])
-                    if cells.CHANGED[0] in set(own["controller"])
-                    else "not in use"
-                    for name, own in both.items()
-                }
-            )
+        both = cells.changed_and_usual(load_runs(folder / aid), usual)
+        names = [name for name in FIVE if name + CHANGED in set(both["controller"])]
+        for table, measure in zip(rows.values(), (MOVES, CIRCLES), strict=True):
+            found = measure.differences(both, [(name + CHANGED, name) for name in names])
+            row = dict.fromkeys(FIVE, "not in use") | dict(zip(names, found, strict=True))
+            table.append({"left out": quoted(aid)} | {quoted(name): cell for name, cell in row.items()})
     return {name: pd.DataFrame(own) for name, own in rows.items()}
 
 
@@ -195,7 +169,7 @@ RENDERED_STUDY = Study(
     "rendered",
     "36 held-out robots on rendered images, on both physics engines",
     30,
-    on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040")),
+    study.on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040")),
     rendered_tables,
 )
 TUNING_STUDIES = Study(

@@ -24,18 +24,14 @@ def lab_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return both measures of each method in both profiles, and the orders and claims that differ."""
     runs = load_runs(folder / "runs")
     parts = {name: runs[runs["mismatch"] == name] for name in PROFILES}
-    shown = {"settling [s]": (cells.MOVES, cells.settling), "circle [mm]": (cells.CIRCLES, cells.millimetres)}
-    rows = [
-        {"method": cells.quoted(method)}
-        | {
-            f"{title}, `{name}`": cell(own[(own["controller"] == method) & (own["task"] == measure.task)])
-            for title, (measure, cell) in shown.items()
-            for name, own in parts.items()
-        }
-        for method in RENDERED
-    ]
+    measured = (("settling [s]", "random", cells.settling), ("circle [mm]", "circle", cells.millimetres))
+    shown = {
+        f"{title}, `{name}`": cells.where("mismatch", name, cells.where("task", task, cell))
+        for title, task, cell in measured
+        for name in PROFILES
+    }
     changes = [*changed_orders(parts), *changed_claims(folder)]
-    return {"lab": pd.DataFrame(rows), "lab_changes": pd.DataFrame(changes)}
+    return {"lab": pd.DataFrame(cells.rows_by_method(runs, shown)), "lab_changes": pd.DataFrame(changes)}
 
 
 def changed_orders(parts: dict[str, pd.DataFrame]) -> Iterator[dict[str, str]]:

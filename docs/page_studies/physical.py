@@ -28,7 +28,6 @@ RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
 NOWHERE: Final = "nowhere"
 PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)
 SHORT: Final = settings(["random.duration=5"])  # [s]; a bullet run costs seconds, and methods settle within three
-CURVES: Final = ("circle", "lemniscate")
 
 
 def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -56,7 +55,7 @@ def rate_rows(runs: pd.DataFrame, plant: str) -> Iterator[dict[str, str]]:
 def count_and_median(runs: pd.DataFrame) -> str:
     """Return how many runs settled and their median settling time [s], as in `40, 0.83`."""
     count, middle = cells.settled(runs), median_with_interval(settling_times(runs)).value
-    return f"{count}, {middle:.2f}" if middle < float("inf") else f"{count}, {MISSING}" if count else "0"
+    return f"{count}, {middle:.2f}" if middle < float("inf") else "0" if count == "0" else f"{count}, {MISSING}"
 
 
 def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
@@ -93,7 +92,7 @@ def long_table(folder: Path) -> dict[str, pd.DataFrame]:
     }
     rows = [
         {"method": row["method"], "curve": curve} | row
-        for curve in CURVES
+        for curve in LONG.commands
         for row in cells.rows_by_method(load_runs(folder / curve), shown)
     ]
     return {"long": pd.DataFrame(rows)}
@@ -116,16 +115,15 @@ def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
     usual = {engine: load_runs(folder / engine) for engine in ENGINES}
     changes = {"`kinematic` instead": dict.fromkeys(ENGINES, "kinematic")}
     changes |= {words: {engine: part_of(words, engine) for engine in ENGINES} for words in SWITCHES}
+    pairs = {cells.quoted(name): (name + cells.CHANGED, name) for name in RENDERED}
     made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
     for words, parts in changes.items():
-        changed = {engine: load_runs(folder / part) for engine, part in parts.items()}
+        both = {engine: cells.changed_and_usual(load_runs(folder / parts[engine]), usual[engine]) for engine in ENGINES}
         for table, measure in zip(made.values(), (cells.MOVES, cells.CIRCLES), strict=True):
-            rows = {engine: {"changed": words, "plant": engine} for engine in ENGINES}
-            for name in RENDERED:
-                both = {engine: cells.changed_and_usual(changed[engine], usual[engine], name) for engine in ENGINES}
-                for engine, cell in next(measure.on_engines(both, [cells.CHANGED])).items():
-                    rows[engine][cells.quoted(name)] = cell
-            table.extend(rows.values())
+            found = dict(zip(pairs, measure.on_engines(both, list(pairs.values())), strict=True))
+            for engine in ENGINES:
+                row = {name: by_engine[engine] for name, by_engine in found.items()}
+                table.append({"changed": words, "plant": engine} | row)
     return {name: pd.DataFrame(rows) for name, rows in made.items()}
 
 
@@ -168,7 +166,7 @@ LONG = Study(
     30,
     {
         curve: sweep("kinematic", BOTH, "endurance", "45000:45010", *settings([f'endurance.curve="{curve}"']))
-        for curve in CURVES
+        for curve in ("circle", "lemniscate")
     },
     long_table,
 )

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
 
 from page_studies import cells
-from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, settings, sweep
+from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, settings, sweep
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of, median_with_interval
 from servobench.harness.batch.results import load_runs
@@ -39,20 +39,11 @@ FROZEN: Final[Mapping[str, Mapping[str, str]]] = {
 
 def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how many of 100 robots settle in each world, a row a method."""
-    parts = [load_runs(folder / part) for part in WORLDS.commands]
-    worlds = {
-        title: own
-        for part in parts
-        for (mismatch, latency), own in part.groupby(["mismatch", "latency_s"], sort=False, dropna=False)
-        for title in [f"`{mismatch}`" + ("" if pd.isna(latency) else f", latency of {1e3 * latency:g} ms")]
-    }
-    methods = dict.fromkeys(name for part in parts for name in part["controller"])
-    rows = [
-        {"method": cells.quoted(name)}
-        | {title: str(cells.settled(own[own["controller"] == name])) for title, own in worlds.items()}
-        for name in methods
-    ]
-    return {"worlds": pd.DataFrame(rows)}
+    runs = pd.concat(load_runs(folder / part) for part in WORLDS.commands)
+    late = [f", latency of {1e3 * each:g} ms" if pd.notna(each) else "" for each in runs["latency_s"]]
+    runs["world"] = runs["mismatch"].map(cells.quoted) + late
+    shown = {world: cells.where("world", world, cells.settled) for world in dict.fromkeys(runs["world"])}
+    return {"worlds": pd.DataFrame(cells.rows_by_method(runs, shown))}
 
 
 def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -97,11 +88,7 @@ def challenges_tables(folder: Path) -> dict[str, pd.DataFrame]:
 
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how the runs of every pair of law and estimator ended."""
-    shown = {
-        "runs": lambda runs: str(len(runs)),
-        "settled": lambda runs: str(cells.settled(runs)),
-        "ended early": cells.ended_early,
-    }
+    shown = {"runs": lambda runs: str(len(runs)), "settled": cells.settled, "ended early": cells.ended_early}
     return {"pairs": pd.DataFrame(cells.rows_by_method(load_runs(folder / "pairs"), shown, title="pair"))}
 
 
@@ -115,7 +102,7 @@ def in_view(runs: pd.DataFrame) -> str:
     return f"{100.0 * (1.0 - column_of(runs, 'feature_invalid_fraction').mean()):.1f}"
 
 
-SENSING_CELLS: Final[Mapping[str, Callable[[pd.DataFrame], str]]] = {
+SENSING_CELLS: Final[Mapping[str, cells.Cell]] = {
     "eyes": cells.share, "eyes_time": cells.settling, "eyes_path": path_ratio, "eyes_view": in_view,
 }  # fmt: skip
 """Name of a table -> what a cell of it says of the runs of a method under a sensing set-up."""
@@ -123,18 +110,20 @@ SENSING_CELLS: Final[Mapping[str, Callable[[pd.DataFrame], str]]] = {
 
 def sensing_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return a table for each measure, with a row for each method and a column for each sensing set-up."""
-    runs = load_runs(folder / "runs")
-    set_ups = dict.fromkeys(runs["sensing"])
-    return {
-        name: pd.DataFrame(
-            {"method": cells.quoted(method)}
-            | {cells.quoted(each): cell(own[own["sensing"] == each]) for each in set_ups}
-            for method, own in cells.by_method(runs)
-        )
-        for name, cell in SENSING_CELLS.items()
-    }
+    runs, tables = load_runs(folder / "runs"), {}
+    for name, cell in SENSING_CELLS.items():
+        shown = {cells.quoted(each): cells.where("sensing", each, cell) for each in dict.fromkeys(runs["sensing"])}
+        tables[name] = pd.DataFrame(cells.rows_by_method(runs, shown))
+    return tables
 
 
+def suite(controllers: Iterable[str], seeds: str, reference_seeds: str) -> Words:
+    """Return the arguments of a suite of all challenges."""
+    names = ("--plants", "kinematic", "--controllers", ",".join(controllers))
+    return ("suite", *names, "--seeds", seeds, "--reference-seeds", reference_seeds)
+
+
+LEARNING_SUITE: Final = suite(FROZEN, "489414:489454", "10")
 WORLDS = Study(
     "worlds",
     "how many of 100 robots settle in worse worlds",
@@ -151,14 +140,11 @@ LEARNING = Study(
     "every equipped method in every challenge, with learning and frozen: 40 robots",
     10,
     {
-        part: (
-            *("suite", "--plants", "kinematic", "--controllers", ",".join(FROZEN), "--seeds", "489414:489454"),
-            *("--reference-seeds", "10", *words),
-        )
-        for part, words in {
-            "learning": (),
-            "frozen": settings(f"{name}.{key}={value}" for name, own in FROZEN.items() for key, value in own.items()),
-        }.items()
+        "learning": LEARNING_SUITE,
+        "frozen": (
+            *LEARNING_SUITE,
+            *settings(f"{name}.{key}={value}" for name, own in FROZEN.items() for key, value in own.items()),
+        ),
     },
     learning_table,
 )
@@ -166,19 +152,7 @@ CHALLENGES = Study(
     "challenges",
     "every method in every challenge: 200 robots that nothing was tuned or chosen on, 50 with references",
     25,
-    {
-        "runs": (
-            "suite",
-            "--plants",
-            "kinematic",
-            "--controllers",
-            ",".join(RENDERED),
-            "--seeds",
-            FRESH,
-            "--reference-seeds",
-            "50",
-        )
-    },
+    {"runs": suite(RENDERED, FRESH, "50")},
     challenges_tables,
 )
 PAIRS_STUDY = Study(
