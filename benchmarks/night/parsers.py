@@ -1,48 +1,49 @@
 """Everything in servobench that reads what others wrote, with valid examples of it, for fuzzing.
 
 A reader gets its input as text or bytes, and a folder for its files. It returns, or raises a `ConfigurationError` or a
-plain `ValueError` of one line.
+plain `ValueError` of one line. In a results folder, a study or an entry of the cache, which others may have written,
+one file holds the input instead of what was written; the files beside it are whole. Nothing vouches for the tables, as
+in a folder of another program, so that they are read and not only found to be changed.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from kit.foreign_fmu import describe, describe_exchange, packed
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from kit.toy import TRAINING, plant_spec
-from night.folder_readers import (
-    ENTRY_SUMS,
-    HOLDER,
-    LEDGER,
-    cache_entry,
-    files,
-    journal,
-    lock,
-    of_runs,
-    other_table,
-    part_name,
-)
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
 from servobench.fmus.compiler import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
+from servobench.harness.analysis.folder import describe_folder, describe_settings
+from servobench.harness.analysis.tables import statistics_tables
+from servobench.harness.batch import results
+from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, refuse_tuning_seeds
 from servobench.harness.cli.selection import split
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.references import read_waypoints
 from servobench.harness.run.request import RunRequest, find_robot, read_mismatch
 from servobench.harness.run.resolution import check_settings, resolve
+from servobench.harness.run.result import RunResult
+from servobench.harness.studies.tuning.objective import Ledger
+from servobench.plant.contract import cache as entries
 from servobench.plant.contract import checksums
+from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
@@ -76,56 +77,51 @@ class Parser:
     error: type[ValueError] = ConfigurationError
 
 
+def _file(name: str, read: Callable[[Path], object]) -> Callable[[str | bytes, Path], object]:
+    """Return a reader of what a file of this name holds."""
+    return lambda content, folder: read(_written(folder / name, content))
+
+
 def _seeds(text: str, _: Path) -> None:
     refuse_tuning_seeds(parse_seeds(text))
 
 
+def _configured(path: Path | None, assignments: list[str]) -> None:
+    settings = read_settings(path, assignments)
+    check_settings(settings, [RUN.plant, RUN.controller, RUN.task])
+    resolve(RUN, settings)
+
+
 def _set(text: str, _: Path) -> None:
-    settings = read_settings(None, [text])
-    check_settings(settings, [RUN.plant, RUN.controller, RUN.task])
-    resolve(RUN, settings)
-
-
-def _config(text: str, folder: Path) -> None:
-    settings = read_settings(_written(folder / "config.toml", text), [])
-    check_settings(settings, [RUN.plant, RUN.controller, RUN.task])
-    resolve(RUN, settings)
+    _configured(None, [text])
 
 
 def _mismatch(text: str, _: Path) -> None:
     assert read_mismatch(str(read_mismatch(text))) == read_mismatch(text)
 
 
-def _mapping(text: str, folder: Path) -> None:
-    read_mapping(FmuMapping, _written(folder / "mapping.toml", text))
+def _robot(path: Path) -> None:
+    catalogue._read.cache_clear()
+    find_robot(str(path))
 
 
-def _robot(ending: str) -> Callable[[str, Path], object]:
-    def read(text: str, folder: Path) -> None:
-        _forget(catalogue._read)
-        find_robot(str(_written(folder / f"robot{ending}", text)))
-
-    return read
-
-
-def _waypoints(text: str, folder: Path) -> None:
-    read_waypoints(_written(folder / "waypoints.csv", text), FEATURE).sampled(0.05, 100)
-
-
-def _networks(content: bytes, folder: Path) -> None:
-    load_networks(_written(folder / "networks.npz", content))
+_config = _file("config.toml", lambda path: _configured(path, []))
+_mapping = _file("mapping.toml", partial(read_mapping, FmuMapping))
+_table, _calibration, _urdf = (_file(f"robot{ending}", _robot) for ending in (".toml", ".yaml", ".urdf"))
+_waypoints = _file("waypoints.csv", lambda path: read_waypoints(path, FEATURE).sampled(0.05, 100))
+_networks = _file("networks.npz", load_networks)
 
 
 def _description(text: str, folder: Path) -> None:
-    path = folder / "described.fmu"
-    with zipfile.ZipFile(path, "w") as packed:
+    with zipfile.ZipFile(folder / "described.fmu", "w") as packed:
         packed.writestr("modelDescription.xml", text.encode(errors="surrogatepass"))
-    _fmu(path.read_bytes(), folder)
+    _fmu((folder / "described.fmu").read_bytes(), folder)
 
 
 def _fmu(content: bytes, folder: Path) -> None:
     path = _written(folder / "foreign.fmu", content)
-    _forget(checksums._digest, read_description)
+    checksums._digest.cache_clear()
+    read_description.cache_clear()
     try:
         root = extract_fmu(path)
         refusals = []
@@ -148,18 +144,112 @@ def _mapped(path: Path, root: Path) -> None:
     mapping_spec(FmuMapping(path, inputs, features, joints=joints), description, 0.05)
 
 
-def _reference(text: str, _: Path) -> None:
-    read_table(text)
-
-
 def _written(path: Path, content: str | bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="surrogatepass"))
     return path
 
 
-def _forget(*functions) -> None:
-    for function in functions:
-        function.cache_clear()
+def _folder(folder: Path, content: Mapping[str, str | bytes]) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, text in content.items():
+        _written(folder / name, text)
+    return folder
+
+
+def of_runs(name: str, *, parts: bool = False) -> Callable[[str | bytes, Path], None]:
+    """Return a reader of a results folder in which one file is the input.
+
+    Args:
+        name: of the file.
+        parts: the batch is under way.
+    """
+
+    def read(given: str | bytes, folder: Path) -> None:
+        whole = files(parts=parts)
+        vouched = whole if name == SUMS else {each: text for each, text in whole.items() if each != SUMS}
+        _read_folder(_folder(folder / "out", {**vouched, name: given}))
+
+    return read
+
+
+def part_name(name: str, folder: Path) -> None:
+    """Read a folder with a stray file among the parts."""
+    place = _folder(folder / "out", files(parts=True))
+    if name and not set(name) & set("/\0") and len(name.encode(errors="surrogatepass")) < 200 and name.strip("."):
+        content = (place / results.part_name(0, results.RUNS)).read_bytes()
+        (place / results.PARTS / name).write_bytes(content)
+    _read_folder(place)
+
+
+def other_table(text: str, folder: Path) -> None:
+    """Read a folder with a table of somebody beside those of the batch."""
+    place = _folder(folder / "out", {**files(), "mine.csv": text})
+    for _ in results.other_tables(place):
+        pass
+
+
+def lock(text: str, folder: Path) -> None:
+    """Take a folder over that another process holds, or held."""
+    place = _folder(folder / "out", {LOCK: text})
+    assert len(str(current_holder(place)).splitlines()) == 1
+    with locked(place) as taken:
+        taken.check()
+
+
+def journal(text: str, folder: Path) -> None:
+    """Read the scores of a study, and go on."""
+    path = _written(folder / "study.jsonl", text)
+    ledger = Ledger(path, SCORES)
+    assert ledger.best() is None or len(ledger)
+    ledger.add({"law": {"gain": 2.0}}, [0.25])
+    again = Ledger(path, SCORES)
+    assert (again.best(), len(again)) == (ledger.best(), len(ledger))
+
+
+def cache_entry(text: str, folder: Path) -> None:
+    """Check an entry of the cache with any checksums: it is whole or made anew."""
+    files_of_entry = {f"{entries.FILES}/a/b.txt": b"foo", SUMS: text}
+    assert entries.is_whole(_folder(folder / "entry", files_of_entry)) in (True, False)
+
+
+@cache
+def files(*, parts: bool = False) -> dict[str, bytes]:
+    """Return the files of a results folder by name; those of a batch under way, or at its end."""
+    keys = {"plant": "kinematic", "controller": "rls", "task": "random", "task_kind": "point_to_point"}
+    row = {"run_id": "a", **keys, "mismatch": "moderate", "seed": 0, "status": "completed", "settling_time_s": 0.5}
+    steps = pd.DataFrame({"run_id": ["a", "a"], "time_s": [0.0, 0.05], "error_norm": [0.2, 0.1]})
+    lost = {"run_id": "b", "seed": 1, "status": "feature_lost", "settling_time_s": None, "reason": "é\n"}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "out"
+        results.create_folder(folder, MANIFEST)
+        results.write_part(folder, 0, [RunResult(row, steps)], "c")
+        results.write_part(folder, 1, [RunResult(row | lost, None, trace="here")], "c")
+        if not parts:
+            results.collect(folder)
+        return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _read_folder(folder: Path) -> None:
+    """Read a folder by everything that reads one, and raise the first refusal at the end."""
+    refusals = []
+    readers: tuple[Callable[[Path], object], ...] = (
+        results.read_manifest, results.load_runs, results.load_steps, results.finished_runs, examine,
+        describe_settings, _judged, results.collect,
+    )  # fmt: skip
+    for read in readers:
+        try:
+            read(folder)
+        except ConfigurationError as error:
+            refusals.append(error)
+    if refusals:
+        raise ConfigurationError(str(refusals[0]))
+
+
+def _judged(folder: Path) -> None:
+    runs = results.load_runs(folder)
+    describe_folder(folder, runs)
+    list(statistics_tables(runs))
 
 
 @cache
@@ -170,6 +260,15 @@ def _npz() -> bytes:
         return (Path(folder) / "networks.npz").read_bytes()
 
 
+SCORES = {"objective": 3, "robots": 2}
+LEDGER = json.dumps(SCORES) + '\n{"settings": {"law": {"gain": 1.5}}, "costs": [0.5, 2]}\n'
+ENTRY_SUMS = "2c26b46b68ffc68ff99b453c1d30413413422d706483bfa0f98a5e886266e7ae  files/a/b.txt\n"  # of the text foo
+HOLDER = '{"owner": "ann", "host": "bench", "pid": 4, "begun": "2026-11-22T01:00:00+00:00", "started": "17"}'
+MANIFEST = {
+    "run_count": 2, "campaign": "c", "created": "2026-11-22T01:00:00+00:00", "python": "3.11.7", "seeds": "0:2",
+    "plants": ["kinematic"], "controllers": ["rls"], "robots": [{"name": "ur5"}], "packages": {"numpy": "2.0"},
+    "configuration": {"run": {"period": 0.05}}, "side_by_side": {},
+}  # fmt: skip
 CONFIG = """
 [run]
 period = 0.05
@@ -251,9 +350,9 @@ WORDS: dict[str, Parser] = {
 FILES: dict[str, Parser] = {
     "configuration": Parser(_config, (CONFIG,), (*TOML_WORDS, *NUMBERS), 2),
     "mapping": Parser(_mapping, (MAPPING,), (*TOML_WORDS, *NUMBERS), 2, error=ValueError),
-    "DH table": Parser(_robot(".toml"), (FOUR_JOINTS,), (*TOML_WORDS, *NUMBERS), 0.02),
-    "calibration": Parser(_robot(".yaml"), CALIBRATIONS, (*YAML_WORDS, *NUMBERS), 0.1),
-    "URDF": Parser(_robot(".urdf"), (odd_urdf(),), (*XML_WORDS, *NUMBERS, "prismatic", "mimic", "floating"), 0.02),
+    "DH table": Parser(_table, (FOUR_JOINTS,), (*TOML_WORDS, *NUMBERS), 0.02),
+    "calibration": Parser(_calibration, CALIBRATIONS, (*YAML_WORDS, *NUMBERS), 0.1),
+    "URDF": Parser(_urdf, (odd_urdf(),), (*XML_WORDS, *NUMBERS, "prismatic", "mimic", "floating"), 0.02),
     "waypoints": Parser(_waypoints, (CSV,), (",", "\n", '"', "\0", ";", *NUMBERS), 2, error=ValueError),
     "networks": Parser(
         _networks, (_npz(),), (*ZIP_WORDS, "<f8", "|O", "shape", "(1000000000000,)"), 0.5, error=ValueError
@@ -265,7 +364,11 @@ FILES: dict[str, Parser] = {
         _fmu, tuple(packed(2 + i % 2, method) for i, method in enumerate(METHODS)), ZIP_WORDS, 0.3, error=ValueError
     ),
     "reference run": Parser(
-        _reference, ("time,a[1],a[2]\n0,1,2\n0.05,1,2\n",), (",", "\n", '"', *NUMBERS), 2, error=ValueError
+        lambda text, _: read_table(text),
+        ("time,a[1],a[2]\n0,1,2\n0.05,1,2\n",),
+        (",", "\n", '"', *NUMBERS),
+        2,
+        error=ValueError,
     ),
 }
 """What stands in files."""

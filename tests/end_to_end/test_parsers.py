@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from night.folder_readers import HOLDER, LEDGER
 from night.fuzzing import Broken, check, fuzz
-from night.parsers import PARSERS, Parser
+from night.parsers import HOLDER, LEDGER, PARSERS, Parser
 from servobench.plant.contract.faults import ConfigurationError
 
 LONG = "9" * 400
