@@ -35,7 +35,6 @@ import dataclasses
 import functools
 import importlib
 import inspect
-import operator
 import os
 import re
 import sys
@@ -249,10 +248,9 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
     """
     default = kind()
     for each in describe_settings(default):
-        section = described_elsewhere(default, each.key)
-        if section and each.value == operator.attrgetter(each.key.removeprefix(f"{section}."))(
-            type(getattr(default, section))()
-        ):
+        section, _, key = each.key.partition(".")
+        own = getattr(default, section)
+        if key and type(own) in classes_with_tables() and key not in differences(own):
             continue
         if not each.meaning:
             raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
@@ -261,12 +259,6 @@ def settings_rows(kind: type[Any]) -> Iterator[tuple[str, ...]]:
         choices = each.allowed.split(", ") if value in each.allowed.split(", ") else []
         others = ", ".join(choice for choice in choices if choice != value)
         yield (f"`{each.key}`{unit}", f"{value}, or {others}" if others else value, each.meaning)
-
-
-def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any settings
-    """Return the section of a dotted key if its class has a table of its own on a page, else an empty string."""
-    section, dot, _ = key.partition(".")
-    return section if dot and type(getattr(config, section)) in classes_with_tables() else ""
 
 
 @functools.cache
@@ -313,15 +305,13 @@ def interface(names: list[str]) -> str:
     for name in names:
         place, _, word = name.removesuffix("(*)").rpartition(".")
         thing = getattr(importlib.import_module(place), word)
-        lines = [defined(thing), inspect.getdoc(thing)]
+        lines, inner = [documented(defined(thing), inspect.getdoc(thing))], []
         if name.endswith("(*)"):
             methods = (each for key, each in vars(thing).items() if inspect.isfunction(each) and key[0] != "_")
             inner = [f"{documented(defined(each), inspect.getdoc(each).partition(NEW_LINE)[0])}\n" for each in methods]
-        else:
-            inner = [unquoted(str(each)) for each in written_signature(thing).parameters.values()]
-        whole = documented(*lines) + (
-            "\n\n" + textwrap.indent("\n".join(inner), "    ") if isinstance(thing, type) else ""
-        )
+        elif isinstance(thing, type):
+            inner = written_arguments(thing)
+        whole = "\n".join([*lines, "", textwrap.indent("\n".join(inner), "    ")])
         parts.append(f"```python\n{whole.rstrip()}\n```")
     return "\n\n".join(parts)
 
@@ -335,7 +325,7 @@ def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
     if len(line) <= LINE:
         return line
     end = line[line.rindex(") -> ") :]
-    arguments = [unquoted(str(each)) for each in found.parameters.values()]
+    arguments = written_arguments(thing)
     by_name = [each.kind is each.KEYWORD_ONLY for each in found.parameters.values()]
     if any(by_name):
         arguments.insert(by_name.index(True), "*")
@@ -347,19 +337,20 @@ def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
 def written_signature(thing: Any) -> inspect.Signature:  # noqa: ANN401 - a function or a class
     """Return the signature with annotations as the source has them, whether or not Python evaluates them."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
-    found = inspect.signature(thing)
-    texts: dict[str, str] = {}
+    found, texts = inspect.signature(thing), dict[str, str]()
     for node in ast.walk(tree):
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            texts.setdefault(node.target.id, ast.unparse(node.annotation))
-        elif isinstance(node, ast.arg) and node.annotation:
-            texts.setdefault(node.arg, ast.unparse(node.annotation))
-    head = tree.body[0]
-    returned = (
-        ast.unparse(head.returns) if isinstance(head, ast.FunctionDef) and head.returns else found.return_annotation
-    )
+        if isinstance(node, ast.AnnAssign | ast.arg) and node.annotation:
+            name = node.arg if isinstance(node, ast.arg) else ast.unparse(node.target)
+            texts.setdefault(name, ast.unparse(node.annotation))
+    returned = getattr(tree.body[0], "returns", None)
     arguments = [each.replace(annotation=texts.get(name, each.annotation)) for name, each in found.parameters.items()]
-    return found.replace(parameters=arguments, return_annotation=returned)
+    result = ast.unparse(returned) if returned else found.return_annotation
+    return found.replace(parameters=arguments, return_annotation=result)
+
+
+def written_arguments(thing: Any) -> list[str]:  # noqa: ANN401 - a function or a class
+    """Return the arguments of a function, or of the constructor of a class, as Python."""
+    return [unquoted(str(each)) for each in written_signature(thing).parameters.values()]
 
 
 def unquoted(signature: str) -> str:
