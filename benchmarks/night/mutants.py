@@ -11,7 +11,7 @@ import ast
 import copy
 import functools
 import gc
-import importlib.abc
+import importlib.machinery
 import importlib.util
 import sys
 import types
@@ -46,17 +46,20 @@ class Mutant:
 
     def tree(self) -> ast.Module:
         """Return the changed module."""
+        tree, node, changed = self._find()
+        return ast.fix_missing_locations(_Replacing(node, changed).visit(tree))
+
+    def _find(self) -> tuple[ast.Module, ast.AST, ast.AST]:
+        """Return the tree of the module, the node with the fault, and the node that takes its place."""
         tree = _parse(self.module)
         node = list(ast.walk(tree))[self.place]
-        _replace(tree, node, list(changes(node))[self.choice])
-        return ast.fix_missing_locations(tree)
+        return tree, node, list(changes(node))[self.choice]
 
     def __str__(self) -> str:
         """Return the line, and what was changed in it."""
-        tree = _parse(self.module)
-        node = list(ast.walk(tree))[self.place]
+        _, node, changed = self._find()
         line = (ROOT / self.module).read_text(encoding="utf-8").splitlines()[node.lineno - 1].strip()
-        before, after = (ast.unparse(each).splitlines()[0] for each in (node, list(changes(node))[self.choice]))
+        before, after = (ast.unparse(each).splitlines()[0] for each in (node, changed))
         return f"{self.module}:{node.lineno}:{node.col_offset + 1}: {before}  ->  {after}    in: {line}"
 
     @property
@@ -82,21 +85,14 @@ class Mutant:
 
         They are those of the statement with the fault, without the statements that stand in its body.
         """
-        tree = _parse(self.module)
-        node = list(ast.walk(tree))[self.place]
+        tree, node, _ = self._find()
         bodies = [part for each in ast.walk(tree) if isinstance(each, ast.FunctionDef) for part in each.body]
-        around = [part for part in bodies for below in ast.walk(part) if below is node]
+        around = [part for part in bodies if node in ast.walk(part)]
         if not around:
             return None
-        inner = [each for each in ast.walk(around[-1]) if isinstance(each, ast.stmt) and _holds(each, node)][-1]
-        first = min(
-            [each.lineno for each in ast.walk(inner) if isinstance(each, ast.stmt) and each is not inner] or [0]
-        )
-        return range(inner.lineno, first or (inner.end_lineno or inner.lineno) + 1)
-
-
-def _holds(statement: ast.stmt, node: ast.AST) -> bool:
-    return any(below is node for below in ast.walk(statement))
+        inner = [each for each in ast.walk(around[-1]) if isinstance(each, ast.stmt) and node in ast.walk(each)][-1]
+        below = [each.lineno for each in ast.walk(inner) if isinstance(each, ast.stmt) and each is not inner]
+        return range(inner.lineno, min(below, default=inner.end_lineno + 1))
 
 
 class Imported:
@@ -196,31 +192,25 @@ def _with(node: ast.AST, **values: object) -> ast.AST:
     return changed
 
 
-def _replace(tree: ast.AST, old: ast.AST, new: ast.AST) -> None:
-    for node in ast.walk(tree):
-        for name, value in ast.iter_fields(node):
-            if value is old:
-                setattr(node, name, new)
-            elif isinstance(value, list):
-                value[:] = [new if each is old else each for each in value]
+class _Replacing(ast.NodeTransformer):
+    """Puts a node in the place of another one."""
+
+    def __init__(self, old: ast.AST, new: ast.AST) -> None:
+        self._old, self._new = old, new
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        return self._new if node is self._old else self.generic_visit(node)
 
 
-class Changed(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
-    """Imports one module from a changed tree."""
+class Changed(importlib.machinery.SourceFileLoader):
+    """Finds one module, and imports it from a changed tree."""
 
     def __init__(self, mutant: Mutant) -> None:
-        self._path, self._tree, self._name = ROOT / mutant.module, mutant.tree(), mutant.name
+        super().__init__(mutant.name, str(ROOT / mutant.module))
+        self._code = compile(mutant.tree(), self.path, "exec")
 
     def find_spec(self, fullname, path=None, target=None):
-        if fullname != self._name:
-            return None
-        return importlib.util.spec_from_file_location(fullname, self._path, loader=self)
+        return importlib.util.spec_from_file_location(fullname, loader=self) if fullname == self.name else None
 
     def get_code(self, fullname):
-        return compile(self._tree, str(self._path), "exec")
-
-    def get_filename(self, fullname):
-        return str(self._path)
-
-    def get_data(self, path):
-        return Path(path).read_bytes()
+        return self._code

@@ -16,19 +16,19 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import pickle
 import random
 import resource
 import sys
 import tempfile
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 from hypothesis import Phase, settings
 
+from night.children import answered, ended
 from night.mutants import ANEW, Changed, Imported, Mutant, mutants
-from night.reach import Reach, Tracer
+from night.reach import Reach, Reached, traced
 
 ROOT = Path(__file__).parents[2]
 
@@ -91,10 +91,12 @@ class Examination:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Try every mutant, once the tests pass without one."""
         imported = Imported()
-        reach = self._trace(session, imported) if session.items and not session.testsfailed else None
-        self.sound = reach is not None
         gc.freeze()  # so that children copy little; frozen objects are not found any more
-        for mutant in self._mutants if reach is not None else []:
+        files = {str(sys.modules[each.name].__file__) for each in self._mutants if each.name in sys.modules}
+        found = [answered(partial(self._trace, session, item, imported, files))[0] for item in session.items]
+        self.sound = bool(found) and None not in found and not session.testsfailed
+        reach = Reach(found)
+        for mutant in self._mutants if self.sound else []:
             if not self._fails(session, mutant, imported, reach):
                 self.survivors.append(str(mutant))
             self.tried += 1
@@ -102,24 +104,13 @@ class Examination:
         gc.unfreeze()
         return True
 
-    def _trace(self, session: pytest.Session, imported: Imported) -> Reach | None:
-        """Return what the tests reach; None if one fails without a fault."""
-        read, write = os.pipe()
-
-        def run() -> int:
-            files = {str(sys.modules[each.name].__file__) for each in self._mutants if each.name in sys.modules}
-            tracer = Tracer(files, imported)
-            session.config.pluginmanager.register(tracer)
-            reach = tracer.run(session)
-            with os.fdopen(write, "wb") as pipe:
-                pickle.dump(reach, pipe)
-            return int(bool(session.testsfailed))
-
-        child = _fork(run)
-        os.close(write)
-        with os.fdopen(read, "rb") as pipe:
-            content = pipe.read()
-        return None if os.waitpid(child, 0)[1] or not content else pickle.loads(content)
+    @staticmethod
+    def _trace(session: pytest.Session, item: pytest.Item, imported: Imported, files: set[str]) -> Reached | None:
+        """Return what a test reaches with its fixtures, of which a fresh process has none; None if it fails."""
+        silence()
+        imported.clear_caches()
+        found = traced(files, lambda: _run(session, [item]))
+        return None if session.testsfailed else found
 
     def _fails(self, session: pytest.Session, mutant: Mutant, imported: Imported, reach: Reach) -> bool:
         """Return whether one of the tests fails with a mutant."""
@@ -130,21 +121,26 @@ class Examination:
             return False
         limit = int(max(MIN_CPU, CPU_MARGIN * reach.cost(tests))) + (ANEW_CPU if lines is None else 0)
 
-        def run() -> int:
+        def run() -> None:
+            silence()
             resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             items = [session.items[test] for test in tests]
-            if mutant.swap(imported):
-                return _run(session, items)
+            try:
+                swapped = mutant.swap(imported)
+            except LookupError:
+                sys.exit(BROKEN)
+            if swapped:
+                sys.exit(_run(session, items))
             for name in [name for name in sys.modules if name.startswith(ANEW)]:
                 del sys.modules[name]
             sys.meta_path.insert(0, Changed(mutant))
-            return int(pytest.main(self._arguments, plugins=[Order([item.nodeid for item in items])]))
+            sys.exit(int(pytest.main(self._arguments, plugins=[Order([item.nodeid for item in items])])))
 
-        status = os.waitpid(_fork(run), 0)[1]
-        if os.WIFEXITED(status) and os.WEXITSTATUS(status) == BROKEN:
+        code = ended(run)
+        if code == BROKEN:
             raise LookupError(f"the module of {mutant} is not imported by the tests of its group")
-        return status != 0
+        return code != 0
 
 
 class Order:
@@ -158,21 +154,11 @@ class Order:
         items.sort(key=lambda item: self._places.get(item.nodeid, len(self._places)))
 
 
-def _fork(work: Callable[[], int]) -> int:
-    """Do something in a silent child, whose exit code it returns; return the child's number."""
-    child = os.fork()
-    if child:
-        return child
-    code = 1
-    try:
-        nothing = os.open(os.devnull, os.O_RDWR)
-        for stream in range(3):
-            os.dup2(nothing, stream)
-        code = work()
-    except LookupError:
-        code = BROKEN
-    finally:
-        os._exit(int(code))
+def silence() -> None:
+    """Let nothing that this process writes be seen any more."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):
+        os.dup2(nothing, stream)
 
 
 def _run(session: pytest.Session, items: list[pytest.Item]) -> int:
