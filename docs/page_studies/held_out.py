@@ -17,7 +17,7 @@ from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.analysis.comparison import MISSING
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import default_config, tuned_file
+from servobench.harness.config.settings import default_config, flatten, tuned_file
 
 PAIRS: Final = [(BETTER, name) for name in BOTH if name != BETTER] + [
     (name.removesuffix(SUFFIX), name) for name in PUBLISHED
@@ -120,19 +120,10 @@ def with_values_of_study(k: int) -> Callable[[Path], Words]:
             studies = tomllib.loads(file.read_text(encoding="utf-8")).get("studies", []) if file.is_file() else []
             if len(studies) > k:
                 values[name] = studies[k]["settings"]
-        assignments = [each for name, own in values.items() for each in assigned(name, own)]
-        return sweep("fmu", values, "random", "40000:40200", *settings(assignments)) if values else ()
+        changes = settings(f"{key}={json.dumps(value)}" for key, value in flatten(values).items())
+        return sweep("fmu", values, "random", "40000:40200", *changes) if values else ()
 
     return command
-
-
-def assigned(section: str, values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield nested settings as `section.key=value`."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from assigned(f"{section}.{key}", value)
-        else:
-            yield f"{section}.{key}={json.dumps(value)}"
 
 
 def without(aid: str | None) -> Words:

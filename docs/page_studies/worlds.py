@@ -13,6 +13,7 @@ from page_studies.study import BOTH, FIVE, RENDERED, SUFFIX, Study, Words, setti
 from servobench.controllers.methods import ESTIMATORS, LAWS
 from servobench.harness.analysis.comparison import column_of, median_with_interval
 from servobench.harness.batch.results import load_runs
+from servobench.harness.config.settings import flatten
 
 SEEDS = "500:600"
 MISMATCHES = (
@@ -141,10 +142,7 @@ LEARNING = Study(
     10,
     {
         "learning": LEARNING_SUITE,
-        "frozen": (
-            *LEARNING_SUITE,
-            *settings(f"{name}.{key}={value}" for name, own in FROZEN.items() for key, value in own.items()),
-        ),
+        "frozen": (*LEARNING_SUITE, *settings(f"{key}={value}" for key, value in flatten(FROZEN).items())),
     },
     learning_table,
 )
