@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from page_studies.claims import CLAIMS, CLAIMS_ENGINES
+from page_studies.claims import CLAIMS, CLAIMS_ENGINES, LAB
 from page_studies.failures import FAILURES
 from page_studies.held_out import AIDS, HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
-from page_studies.lab import LAB
 from page_studies.noise import NOISE_STUDIES
 from page_studies.physical import DYNAMICS, ENDS, LONG, RATES_STUDY
 from page_studies.pictures import PERFORMANCE, README
