@@ -39,7 +39,7 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +90,8 @@ def renewed(page: Path) -> str:
         "install": lambda part: install_lines(part[3]),
         "attributes": lambda part: attributes_table(labelled(part[3])),
         "interface": lambda part: interface(part[3].split(",")),
-        "table": lambda part: measured_table(part, page.parent),
-        "stored": lambda part: stored_links(part, page.parent),
+        "table": lambda part: measured(part, page.parent),
+        "stored": lambda part: measured(part, page.parent),
     }
     text = page.read_text(encoding="utf-8")
     return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
@@ -184,35 +184,22 @@ def aids_in_words(aids: AidsConfig) -> str:
     return "all" + (f", but {', '.join(words)}" if other else "")
 
 
-def measured_table(part: re.Match[str], folder: Path) -> str:
-    """Return a table of docs/tables and how it was made; the part as it is before its study.
+def measured(part: re.Match[str], folder: Path) -> str:
+    """Return a table of docs/tables, or links to several, and how they were made; the part as it is before their study.
 
     Args:
-        part: of the page, which names the table.
+        part: of the page, which names the tables.
         folder: of the page, from which its links go.
     """
-    path = stored_tables.FOLDER / f"{part[3]}.csv"
-    if not path.exists():
-        return part[4].strip("\n")
-    rows = stored_tables.read(path).table
-    cells = [tuple(row) for row in rows.itertuples(index=False)]
-    link = Path(os.path.relpath(path, folder)).as_posix()
-    return f"{table(tuple(rows.columns), cells)}\n\n{origin(path)}; [commands]({link})"
-
-
-def stored_links(part: re.Match[str], folder: Path) -> str:
-    """Return links to tables of docs/tables, and how they were made; see `measured_table`."""
     paths = [stored_tables.FOLDER / f"{name}.csv" for name in part[3].split(",")]
     if not all(path.exists() for path in paths):
         return part[4].strip("\n")
-    links = [f"[`{path.stem}`]({Path(os.path.relpath(path, folder)).as_posix()})" for path in paths]
-    return f"All rows: {', '.join(links)} ({origin(paths[0])})"
-
-
-def origin(path: Path) -> str:
-    """Return how a table was made."""
-    stamp = stored_tables.read(path).stamp
-    return f"commit {stamp['commit'][:12]}, version {stamp['version']}"
+    stamp, rows = stored_tables.read(paths[0])
+    origin = f"commit {stamp['commit'][:12]}, version {stamp['version']}"
+    links = {path.stem: Path(os.path.relpath(path, folder)).as_posix() for path in paths}
+    if part[2] == "stored":
+        return f"All rows: {', '.join(f'[`{name}`]({link})' for name, link in links.items())} ({origin})"
+    return f"{table(tuple(rows), rows.itertuples(index=False))}\n\n{origin}; [commands]({links[part[3]]})"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
@@ -382,7 +369,7 @@ def variables_table() -> str:
     return table(("variable", "size", "role", "unit", "meaning"), rows)
 
 
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def table(header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """Return a Markdown table."""
     lines = [header, ("---",) * len(header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
