@@ -107,15 +107,17 @@ def main() -> None:
     block = f"`Bench.step`, {BLOCK} runs side by side"
     steps = {BARE: bare_calls(plants[0]), "`Bench.step`, one run": plant_steps(plants[1]),
              "fmpy's `FMU2Slave`": fmpy_calls(plants[2]), block: plant_steps(plants[3])}  # fmt: skip
-    instants = {name: itertools.count() for name in steps}
+    instants, runs = (
+        {name: itertools.count() for name in steps},
+        {name: BLOCK if name == block else 1 for name in steps},
+    )
 
     def many(name: str) -> None:
-        for k in itertools.islice(instants[name], CALLS // BLOCK if name == block else CALLS):
+        for k in itertools.islice(instants[name], CALLS // runs[name]):
             steps[name](k)
 
     times = times_in_turns({name: partial(many, name) for name in steps}, rounds, time.perf_counter)
-    runs = {name: CALLS // BLOCK * BLOCK if name == block else CALLS for name in steps}
-    best = {name: min(values) / runs[name] * 1e6 for name, values in times.items()}
+    best = {name: min(values) / (CALLS // runs[name] * runs[name]) * 1e6 for name, values in times.items()}
     print(table(["step of the FMU of the UR5", "a step", "× bare calls"],
                 [[name, f"{value:.2f} µs", f"{value / best[BARE]:.2f}"] for name, value in best.items()]))  # fmt: skip
     for plant in plants:

@@ -3,7 +3,6 @@
 python benchmarks/hidden_plants.py --plant kinematic --robots 200 --first 81000
 """
 
-import argparse
 import time
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 import servobench
+from measuring import options
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build, draw_robot
 from servobench.harness.run.identification import command_response, read_log
@@ -72,33 +72,24 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     said, found = mistakes(log, nominal, others)
     response = command_response(log)
     about |= {"seconds": time.perf_counter() - began, "said": said}
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     true = parameters(draw_robot(request)[0], nominal) | {"latency": latency}
     if response is not None:
-        errors, sizes = (
-            (response.delay - delay, response.lag - sections.get("lag", np.nan)),
-            np.sqrt(np.diag(response.covariance)),
-        )
-        for name, error, size in zip(("command_delay", "lag"), errors, np.maximum(sizes, 1e-4), strict=True):
-            told = bool(np.isfinite(error))  # the drive of an engine has no lag of first order
-            rows.append(about | {"parameter": name, "error": error, "deviation": size, "told": told})
-    for k, name in enumerate(found.names if found is not None else ()):
-        if name in true:
-            error = found.values[k] - true[name]
-            rows.append(
-                about
-                | {"parameter": name, "error": error, "deviation": found.deviations[k], "told": bool(found.told[k])}
-            )
-    return rows or [about | {"parameter": ""}]
+        errors = response.delay - delay, response.lag - sections.get("lag", np.nan)
+        sizes = np.maximum(np.sqrt(np.diag(response.covariance)), 1e-4)
+        told = np.isfinite(errors)  # the drive of an engine has no lag of first order
+        rows += zip(("command_delay", "lag"), errors, sizes, told, strict=True)
+    if found is not None:
+        estimates = zip(found.names, found.values, found.deviations, found.told, strict=True)
+        rows += [(name, value - true[name], *other) for name, value, *other in estimates if name in true]
+    return [
+        about | dict(zip(("parameter", "error", "deviation", "told"), row, strict=False)) for row in rows or [("",)]
+    ]
 
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--plant", default="kinematic")
-    parser.add_argument("--robots", type=int, default=200)
-    parser.add_argument("--first", type=int, default=81000)
-    given = parser.parse_args()
+    given = options(__doc__, plant="kinematic", robots=200, first=81000)
     table = pd.DataFrame(
         [row for seed in range(given.first, given.first + given.robots) for row in hidden(seed, given.plant)]
     )

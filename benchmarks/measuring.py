@@ -22,20 +22,22 @@ METHODS = (
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110
+QUICK = {"action": "store_true", "help": "few runs only: test the page, not the speed"}  # an option
 
 
-def options(description: str | None, **further: dict[str, Any]) -> argparse.Namespace:
-    """Return the options of a benchmark: `quick`, for a test of the page, and `further` ones with their keywords."""
+def options(description: str | None, **named: Any) -> argparse.Namespace:  # noqa: ANN401 - of any type
+    """Return the options of a command, each given by its default, default and help text, or keywords of argparse."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few runs only: test the page, not the speed")
-    for name, keywords in further.items():
+    for name, given in named.items():
+        default, text = given if isinstance(given, tuple) else (given, None)
+        keywords = given if isinstance(given, dict) else {"default": default, "type": type(default), "help": text}
         parser.add_argument(f"--{name}", **keywords)
     return parser.parse_args()
 
 
 def asked_to_be_quick(description: str | None) -> bool:
     """Return whether `--quick` was given, the only option."""
-    return bool(options(description).quick)
+    return bool(options(description, quick=QUICK).quick)
 
 
 def resolved_runs(plant: str, method: str, count: int, duration: float | None = None) -> list[Any]:

@@ -123,8 +123,7 @@ def main() -> None:
         return
     law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.moves))
     state = law.start(problems()[0][1])
-    times: tuple[list[float], list[float]] = ([], [])
-    difference = 0.0
+    times, difference = [], 0.0
     for J, observation, reference in problems()[:count]:
         started = time.process_time()
         state, velocity = law.command(state, Estimate(J), observation, reference)
@@ -132,10 +131,9 @@ def main() -> None:
         between = time.process_time()
         other_step = other.step(J, observation, reference)
         ended = time.process_time()
-        times[0].append(between - started)
-        times[1].append(ended - between)
+        times.append((between - started, ended - between))
         difference = max(difference, float(np.abs(own_step - other_step).max()))
-    own, theirs = (1e3 * float(np.median(column)) for column in times)
+    own, theirs = 1e3 * np.median(times, axis=0)
     block = 1e3 * block_time(law) / BLOCK
     names = "do-mpc with IPOPT", "`mpc`, one run", f"`mpc`, {BLOCK} runs side by side"
     rows = [

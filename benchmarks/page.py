@@ -61,6 +61,7 @@ def main() -> None:
     """Write the page."""
     options = measuring.options(
         __doc__,
+        quick=measuring.QUICK,
         against={"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"},
         out={"type": Path, "default": ROOT / "docs"},
         only={"nargs": "*", "metavar": "SCRIPT", "help": "benchmarks to run, such as limits; default: all"},

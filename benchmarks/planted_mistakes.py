@@ -6,7 +6,6 @@
 Of a pair one mistake is to be named, and the other one after its remedy, which is the log with the other one alone.
 """
 
-import argparse
 import re
 import tempfile
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import pandas as pd
 from hidden_plants import draw_hidden
 
 import servobench
+from measuring import options
 from servobench.harness.batch.logs import logged_in_file
 from servobench.harness.run.identification import read_log
 from servobench.harness.run.preflight import mistakes
@@ -163,13 +163,14 @@ def planted(seed: int, folder: Path, pairs: int) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--logs", type=int, default=0, help="in which mistakes are planted")
-    parser.add_argument("--pairs", type=int, default=66, help="of mistakes, in each of these logs")
-    parser.add_argument("--clean", type=int, default=0, help="logs without a mistake")
-    parser.add_argument("--first", type=int, default=81000)
-    parser.add_argument("--out", type=Path, help="CSV file for a row a log")
-    given = parser.parse_args()
+    given = options(
+        __doc__,
+        logs=(0, "in which mistakes are planted"),
+        pairs=(66, "of mistakes, in each of these logs"),
+        clean=(0, "logs without a mistake"),
+        first=81000,
+        out={"type": Path, "help": "CSV file for a row a log"},
+    )
     with tempfile.TemporaryDirectory() as folder:
         lines = [said(logged(seed), Path(folder)) for seed in range(given.first, given.first + given.clean)]
         rows = []

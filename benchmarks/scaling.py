@@ -145,7 +145,7 @@ def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
 
 def main() -> None:
     """Print a table of exponents, and the picture's line."""
-    given = measuring.options(__doc__, picture={"type": Path})
+    given = measuring.options(__doc__, quick=measuring.QUICK, picture={"type": Path})
     count, calls = (2, 2) if given.quick else (None, 60)
     sizes = {"units": (50, 100, 150, 300, 600), "horizon": (4, 7, 10, 20, 40), "joints": (3, 6, 12, 24)}
     units, horizons, joints = (each[:count] for each in sizes.values())

@@ -15,7 +15,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from measuring import METHODS, PERIODS, WIDTH, options, resolved_runs, table, write_picture
+from measuring import METHODS, PERIODS, QUICK, WIDTH, options, resolved_runs, table, write_picture
 from servobench.harness.pictures import style
 from servobench.harness.run import episode, log
 from servobench.harness.run.experiment import build
@@ -118,7 +118,7 @@ def draw(sides: dict[str, Costs], path: Path) -> None:
 
 def main() -> None:
     """Print a table of the parts, and the picture's line."""
-    given = options(__doc__, picture={"type": Path})
+    given = options(__doc__, quick=QUICK, picture={"type": Path})
     clock, (runs, block) = Clock(), (1, 4) if given.quick else (15, 128)
     for owner, names, part in SHARED:
         for name in names:

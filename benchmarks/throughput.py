@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from measuring import METHODS, PERIODS, microseconds, options, seeds, sweep_times, table
+from measuring import METHODS, PERIODS, QUICK, microseconds, options, seeds, sweep_times, table
 
 HERE = Path(__file__).resolve().parents[1]
 ALONE = """
@@ -80,7 +80,7 @@ def ratio(cost: Callable[..., float], now: float, checkout: Path, plant: str, me
 def main() -> None:
     """Print a table of times and ratios, and the time of the whole."""
     against = {"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"}
-    given = options(__doc__, against=against, rounds={"type": int, "default": 2, "help": "of this checkout"})
+    given = options(__doc__, quick=QUICK, against=against, rounds=(2, "of this checkout"))
     others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in given.against)}
     plants, methods = ["kinematic", "fmu"], list(METHODS)
     counts, old_counts, alone, rounds, whole = (128, 1280), (4, 84), 15, given.rounds, 1000

@@ -13,7 +13,6 @@ over the methods i of a plant, where a pair whose medians on the plant are withi
 (Li et al., Evaluating Real-World Robot Manipulation Policies in Simulation, CoRL 2024).
 """
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,6 +24,7 @@ import pandas as pd
 from hidden_plants import draw_hidden, parameters
 
 import servobench
+from measuring import options
 from servobench.harness.config.description import toml
 from servobench.harness.config.settings import Settings, flatten, nest
 from servobench.harness.run.experiment import build, draw_robot
@@ -210,22 +210,20 @@ def report(table: pd.DataFrame) -> str:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--challenges", default="", help="names, or all of grades II and III; default: hidden plants")
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--first", type=int, default=81000)
-    parser.add_argument("--runs", type=int, default=20, help="on each plant and each twin")
-    parser.add_argument("--methods", default=",".join(EQUIPPED))
-    parser.add_argument("--told", action="store_true", help="give the twin the words of the world, too")
-    parser.add_argument("--out", type=Path, help="CSV file for a row a method and plant")
-    given = parser.parse_args()
-    names = challenge_names() if given.challenges == "all" else given.challenges.split(",") if given.challenges else ()
-    chosen = [find_challenge(name) for name in names]
-    chosen = [
-        replace(each, reference=REFERENCES)
-        for each in chosen
-        if given.challenges != "all" or each.grade.name in ("II", "III")
-    ] or HIDDEN
+    given = options(
+        __doc__,
+        challenges=("", "names, or all of grades II and III; default: hidden plants"),
+        robots=3,
+        first=81000,
+        runs=(20, "on each plant and each twin"),
+        methods=",".join(EQUIPPED),
+        told={"action": "store_true", "help": "give the twin the words of the world, too"},
+        out={"type": Path, "help": "CSV file for a row a method and plant"},
+    )
+    chosen = [find_challenge(name) for name in given.challenges.split(",") if name not in ("", "all")]
+    if given.challenges == "all":
+        chosen = [each for each in map(find_challenge, challenge_names()) if each.grade.name in ("II", "III")]
+    chosen = [replace(each, reference=REFERENCES) for each in chosen] or HIDDEN
     methods = [*EQUIPPED, *PUBLISHED] if given.methods == "all" else given.methods.split(",")
     tables = []
     for challenge in chosen:
