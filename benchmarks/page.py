@@ -9,7 +9,6 @@ An older checkout that needs other libraries has its environment in `.venv`.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import os
 import platform
@@ -17,10 +16,10 @@ import re
 import subprocess
 import sys
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import measuring
+from servobench.harness.config.installation import installed_version
 
 ROOT = Path(__file__).resolve().parents[1]
 LIBRARIES = (
@@ -47,14 +46,12 @@ def machine() -> str:
     """Return machine, date and versions."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    versions = [f"Python {platform.python_version()}"]
-    for library in LIBRARIES:
-        with contextlib.suppress(PackageNotFoundError):
-            versions.append(f"{library} {version(library)}")
+    versions = {"Python": platform.python_version()} | {library: installed_version(library) for library in LIBRARIES}
     return (
         f"Machine: {next(names, platform.machine())}, {os.cpu_count()} processors, {platform.system()} "
-        f"{platform.machine()}; {datetime.datetime.now(tz=datetime.UTC):%Y-%m-%d}.\n{', '.join(versions)}."
-    )
+        f"{platform.machine()}; {datetime.datetime.now(tz=datetime.UTC):%Y-%m-%d}.\n"
+        + ", ".join(f"{name} {found}" for name, found in versions.items() if found) + "."
+    )  # fmt: skip
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ code host sets the same TeX. SVG pictures stand in the page, so that they follow
 import json
 import re
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,12 @@ from myst_parser.parsers.sphinx_ import MystParser
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
+from servobench.harness.config.installation import installed_version
+
 project = "servobench"
 author = "The servobench maintainers"
 project_copyright = "The servobench maintainers, BSD-3-Clause"
-try:
-    release = metadata.version("servobench")
-except metadata.PackageNotFoundError:  # a checkout that is on the path only
-    release = "0"
+release = installed_version() or "0"  # of a checkout that is on the path only
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 exclude_patterns = ["tables", "page_studies", "examples"]

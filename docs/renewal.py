@@ -30,10 +30,10 @@ from page_studies import STUDIES
 from page_studies.study import Study
 from servobench.harness.batch import results
 from servobench.harness.batch.results import read_manifest
+from servobench.harness.config.installation import CODE_FOLDERS
 from servobench.harness.run.result import CRASHED
 
 ROOT: Final = Path(__file__).parents[1]
-CODE: Final = ("plant", "controllers", "fmus", "harness")  # what results depend on
 DIGEST: Final = "code.sha256"  # in the folder of a study: of the code that its runs were made with
 DONE: Final = ".done"  # suffix of a file beside a part that is complete; it holds the command
 MIN_ROBOTS: Final = {"claims": 6}  # of a command that refuses fewer
@@ -132,7 +132,7 @@ def fewer(command: Sequence[str], robots: int | None) -> list[str]:
 def code_digest() -> str:
     """Return a digest of the code that results depend on."""
     digest = hashlib.sha256()
-    for top in CODE:
+    for top in CODE_FOLDERS:
         for path in sorted((ROOT / top).rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".md":
                 digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
