@@ -11,129 +11,100 @@ false numpy and a false clock behind, `Quiet`, and `constant` of this package.
 
 from __future__ import annotations
 
-import argparse
-import os
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
 
-from kit.command import judged, left_behind
+from measuring import options
 from night import hostile_controllers
+from night.kills import SOON, Sweep
 from servobench.plant.contract.seeds import named_seed
 
 HOSTILE: Final = Path(hostile_controllers.__file__)
 CONTROLLERS: Final = (*(f"{HOSTILE}:{name}" for name in ("Falsifies", "Sometimes", "Quiet")), "constant")
 FIRST_SEED: Final = 100_000
-MARK: Final = "SERVOBENCH_HOSTILE_SWEEP"  # an environment variable that everything started here inherits
-SOON: Final = 5.0  # [s] until nothing is left of a command that was killed
 SMALL_FILE: Final = 4000  # [bytes] less than a part of the results: a disk that is full
 HARMLESS: Final = ("Forks", "InterruptsItself", "LeavesChildren", "Prints")  # runs that complete all the same
 KILLED_AT: Final = (0.25, 0.6)  # share of the runs
 
 
-class Night:
-    """The calls of one sweep."""
-
-    def __init__(self, folder: Path, runs: int, workers: int, timeout: float) -> None:
-        self.folder, self.runs = folder, runs
-        seeds = runs // len(CONTROLLERS)
-        self.arguments = [
-            *("sweep", "--controllers", ",".join(CONTROLLERS), "--seeds", f"{FIRST_SEED}:{FIRST_SEED + seeds}"),
-            *("--set", "random.duration=0.5", "--workers", str(workers)),
-            *("--run-timeout", str(timeout), "--run-memory", "800MB"),
-        ]
-
-    def start(self, name: str, *further: str, **environment: str) -> subprocess.Popen[str]:
-        """Start the sweep into the folder `name`."""
-        call = [sys.executable, "-m", "servobench", *self.arguments, "--out", str(self.folder / name), *further]
-        known = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), MARK: str(self.folder), **environment}
-        return subprocess.Popen(call, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=known)
-
-    def finish(self, process: subprocess.Popen[str], code: int) -> str:
-        """Wait for a sweep, whose exit code is known, and return what it wrote to standard error."""
-        errors = process.communicate()[1]
-        if process.returncode != code or "Traceback" in errors:
-            sys.exit(f"exit code {process.returncode} instead of {code}:\n{errors}")
-        return errors
-
-    def kill_at(self, share: float, process: subprocess.Popen[str]) -> float:
-        """Kill a sweep when a share of its runs is there; return how long something of it lived on [s]."""
-        self.wait(process, lambda: self.count("hard") >= share * self.runs)
-        process.kill()
-        killed = time.monotonic()
-        while process.poll() is None or self.left():
-            if time.monotonic() - killed > SOON:
-                sys.exit(f"{SOON:g} s after the sweep was killed, these live on: {self.left()}")
-            time.sleep(0.02)
-        lived = time.monotonic() - killed
-        process.communicate()
-        return lived
-
-    def wait(self, process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
-        """Wait until a condition holds while a sweep runs."""
-        while not condition():
-            if process.poll() is not None:
-                sys.exit(f"the sweep ended early with exit code {process.returncode}:\n{process.communicate()[1]}")
-            time.sleep(0.2)
-
-    def count(self, name: str) -> int:
-        """Return how many runs of a sweep are surely finished: the index of its last part."""
-        parts = sorted((self.folder / name / "parts").glob("[0-9]*.runs.parquet"))
-        return int(parts[-1].name.split(".")[0]) if parts else 0
-
-    def left(self) -> list[str]:
-        """Return the processes of sweeps that still run."""
-        return left_behind(MARK, str(self.folder))
+def finish(sweep: Sweep, process: subprocess.Popen[bytes], code: int) -> str:
+    """Wait for a sweep, whose exit code is known, and return what it wrote to standard error."""
+    found, errors = process.wait(), sweep.said()
+    if found != code or "Traceback" in errors:
+        sys.exit(f"exit code {found} instead of {code}:\n{errors}")
+    return errors
 
 
-def carry_out(night: Night) -> tuple[float, float, list[float]]:
+def kill_at(count: float, sweep: Sweep, process: subprocess.Popen[bytes]) -> float:
+    """Kill a sweep when so many of its runs are there; return how long something of it lived on [s]."""
+    wait(sweep, process, count)
+    process.kill()
+    process.wait()
+    lived, left = sweep.outlived(SOON)
+    if left:
+        sys.exit(f"{SOON:g} s after the sweep was killed, these live on: {left}")
+    return lived
+
+
+def wait(sweep: Sweep, process: subprocess.Popen[bytes], count: float) -> None:
+    """Wait until so many runs are there while a sweep runs."""
+    while finished(sweep) < count:
+        if process.poll() is not None:
+            sys.exit(f"the sweep ended early with exit code {process.returncode}:\n{sweep.said()}")
+        time.sleep(0.2)
+
+
+def finished(sweep: Sweep) -> int:
+    """Return how many runs of a sweep are surely finished: the index of its last part."""
+    parts = sorted((sweep.folder / "parts").glob("[0-9]*.runs.parquet"))
+    return int(parts[-1].name.split(".")[0]) if parts else 0
+
+
+def carry_out(quiet: Sweep, hard: Sweep, runs: int) -> tuple[float, float, list[float]]:
     """Carry out the quiet and the hard sweep; return what they took [s], and how long killed ones lived on [s]."""
     began = time.monotonic()
-    night.finish(night.start("quiet", PEACE="1"), 0)
-    quiet = time.monotonic() - began
+    finish(quiet, quiet.start(), 0)
+    calm = time.monotonic() - began
     began = time.monotonic()
-    lived = [night.kill_at(KILLED_AT[0], night.start("hard"))]
-    process = night.start("hard", "--resume")
+    lived = [kill_at(KILLED_AT[0] * runs, hard, hard.start())]
+    process = hard.start()
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (SMALL_FILE, SMALL_FILE))
-    full = night.finish(process, 1)
+    full = finish(hard, process, 1)
     if "File too large" not in full:
         sys.exit(f"a full disk was not told:\n{full}")
-    process = night.start("hard", "--resume")
-    known = night.count("hard")
-    night.wait(process, lambda: night.count("hard") > known)
+    process = hard.start()
+    wait(hard, process, finished(hard) + 1)
     process.send_signal(signal.SIGSTOP)  # so that it is not over before the second one has begun
-    second = night.finish(night.start("hard", "--resume"), 2)
+    second = finish(hard, hard.start(), 2)
     process.send_signal(signal.SIGCONT)
     if "another process" not in second and "is being written" not in second:
         sys.exit(f"a second process was not refused:\n{second}")
-    lived.append(night.kill_at(KILLED_AT[1], process))
-    night.finish(night.start("hard", "--resume"), 0)
-    hard = time.monotonic() - began
-    if night.left():
-        sys.exit(f"the sweep is over and these live on: {night.left()}")
-    return quiet, hard, lived
+    lived.append(kill_at(KILLED_AT[1] * runs, hard, process))
+    finish(hard, hard.start(), 0)
+    took = time.monotonic() - began
+    if left := [each for sweep in (quiet, hard) for each in sweep.outlived(0.0)[1]]:
+        sys.exit(f"the sweep is over and these live on: {left}")
+    return calm, took, lived
 
 
-def judge(night: Night) -> pd.DataFrame:
+def judge(quiet: pd.DataFrame, hard: pd.DataFrame, runs: int) -> pd.DataFrame:
     """Hold the two tables against each other; return how many runs ended how, by what was done to them."""
-    quiet, hard = (pd.read_parquet(night.folder / name / "runs.parquet") for name in ("quiet", "hard"))
-    if len(hard) != night.runs or list(hard["run_id"]) != list(quiet["run_id"]):
-        sys.exit(f"{len(hard)} rows instead of {night.runs}, or other ones")
-    hard["harm"] = [_harm(*each) for each in zip(hard["controller"], hard["seed"], strict=True)]
-    spared = hard["harm"].isin(["", *HARMLESS])
-    found, wanted = judged(hard)[spared].drop(columns="harm"), judged(quiet)[spared]
-    pd.testing.assert_frame_equal(found, wanted, check_exact=True)
+    if len(hard) != runs or list(hard["run_id"]) != list(quiet["run_id"]):
+        sys.exit(f"{len(hard)} rows instead of {runs}, or other ones")
+    harm = pd.Series([_harm(*each) for each in zip(hard["controller"], hard["seed"], strict=True)], name="harm")
+    spared = harm.isin(["", *HARMLESS])
+    pd.testing.assert_frame_equal(hard[spared], quiet[spared], check_exact=True)
     if (hard[~spared]["status"] == "completed").any():
         sys.exit(f"runs to which harm was done completed:\n{hard[~spared & (hard['status'] == 'completed')]}")
-    return hard.groupby(["harm", "status"]).size().rename("runs").reset_index()
+    return hard.groupby([harm, "status"]).size().rename("runs").reset_index()
 
 
 def _harm(controller: str, seed: int) -> str:
@@ -143,21 +114,27 @@ def _harm(controller: str, seed: int) -> str:
     return "" if found is None else found.__name__
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Carry everything out and print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=10_000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--timeout", type=float, default=10.0, help="[s] of a run")
-    parser.add_argument("--folder", type=Path, help="keeps both sweeps; default: a temporary one")
-    given = parser.parse_args(arguments)
+    given = options(
+        __doc__,
+        runs=10_000,
+        workers=2,
+        timeout=(10.0, "[s] of a run"),
+        folder={"type": Path, "help": "keeps both sweeps; default: a temporary one"},
+    )
     with tempfile.TemporaryDirectory(prefix="servobench-night-") as scratch:
-        runs = len(CONTROLLERS) * (given.runs // len(CONTROLLERS))
-        night = Night(given.folder or Path(scratch), runs, given.workers, given.timeout)
-        quiet, hard, lived = carry_out(night)
-        print(judge(night).to_string(index=False))
-        print(f"{night.runs} rows; all runs that nothing was done to equal those of the quiet sweep bit for bit")
-        print(f"quiet {quiet:.0f} s, hard {hard:.0f} s: {hard / quiet:.1f} times as long")
+        robots, folder = given.runs // len(CONTROLLERS), given.folder or Path(scratch)
+        runs = robots * len(CONTROLLERS)
+        how = (
+            ",".join(CONTROLLERS), f"{FIRST_SEED}:{FIRST_SEED + robots}", "--set", "random.duration=0.5",
+            "--workers", str(given.workers), "--run-timeout", str(given.timeout), "--run-memory", "800MB",
+        )  # fmt: skip
+        quiet, hard = Sweep(folder / "quiet", *how, PEACE="1"), Sweep(folder / "hard", *how)
+        calm, took, lived = carry_out(quiet, hard, runs)
+        print(judge(quiet.table(), hard.table(), runs).to_string(index=False))
+        print(f"{runs} rows; all runs that nothing was done to equal those of the quiet sweep bit for bit")
+        print(f"quiet {calm:.0f} s, hard {took:.0f} s: {took / calm:.1f} times as long")
         print(f"after each kill of the parent everything was gone within {max(lived):.2f} s")
 
 

@@ -9,7 +9,6 @@ started must be gone 5 s later. A table has six signals on its way; each second 
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import signal
@@ -18,13 +17,16 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
+import psutil
 
 from kit.command import judged, left_behind
+from measuring import options
 from night import hostile_controllers
 from servobench.harness.batch.processes import descendants
 
@@ -49,23 +51,37 @@ class Outcome:
 
 
 class Sweep:
-    """A sweep that is signalled and goes on."""
+    """A sweep that is ended by force and goes on."""
 
-    def __init__(self, folder: Path, controllers: str, runs: int) -> None:
+    def __init__(self, folder: Path, controllers: str, seeds: str, *further: str, **environment: str) -> None:
         self.folder = folder
-        self._call = ["sweep", "--controllers", controllers, "--seeds", f"0:{runs // 2}", "--workers", "2", "--out"]
-        self._known = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), MARK: str(folder), "PEACE": "1"}
+        self._call = ["sweep", "--controllers", controllers, "--seeds", seeds, *further, "--out", str(folder)]
+        self._known = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), MARK: str(folder), **environment}
 
     def start(self) -> subprocess.Popen[bytes]:
         """Start it, or go on."""
-        further = [str(self.folder), *["--resume"] * self.folder.exists()]
-        call = [sys.executable, "-m", "servobench", *self._call, *further]
+        call = [sys.executable, "-m", "servobench", *self._call, *["--resume"] * self.folder.exists()]
         with self.folder.with_suffix(".txt").open("wb") as said:
             return subprocess.Popen(call, env=self._known, stdout=subprocess.DEVNULL, stderr=said)
 
+    def said(self) -> str:
+        """Return what the last call wrote to standard error."""
+        return self.folder.with_suffix(".txt").read_text(errors="replace")
+
+    def outlived(self, most: float) -> tuple[float, list[str]]:
+        """Wait until nothing is left of an ended call, so long at most; return how long it took [s] and the rest."""
+        ended = time.monotonic()
+        while (left := left_behind(MARK, str(self.folder))) and time.monotonic() - ended < most:
+            time.sleep(0.02)
+        return time.monotonic() - ended, left
+
+    def table(self) -> pd.DataFrame:
+        """Return the table of runs without the times of the clock."""
+        return judged(pd.read_parquet(self.folder / "runs.parquet"))
+
     def complain(self, code: int) -> str:
         """Return the fault of a call that has ended: a trace, or an end that it should not have."""
-        said = self.folder.with_suffix(".txt").read_text(errors="replace")
+        said = self.said()
         told = code in (0, 1, 130, -1, -2, -3, -9, -15) or "was ended while it started: SIG" in said
         return "" if told and "Traceback" not in said else said[-1500:]
 
@@ -92,16 +108,11 @@ def signalled(sweep: Sweep, process: subprocess.Popen[bytes], source: random.Ran
 
 
 def _victims(command: int) -> dict[str, list[int]]:
-    children = descendants(command)
-    near = [each for each in children if _parent(each) == command]
-    return dict(zip(VICTIMS, ([command], near, [each for each in children if each not in near]), strict=True))
-
-
-def _parent(process: int) -> int:
-    try:
-        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return 0
+    near = []
+    with suppress(psutil.NoSuchProcess):
+        near = [each.pid for each in psutil.Process(command).children()]
+    below = [each for each in descendants(command) if each not in near]
+    return dict(zip(VICTIMS, ([command], near, below), strict=True))
 
 
 def end(sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], found: Outcome) -> int | None:
@@ -112,10 +123,7 @@ def end(sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], f
         found.faults.append(f"{last}: the command still runs after {PATIENCE:g} s")
         process.kill()
         code = process.wait()
-    ended = time.monotonic()
-    while (left := left_behind(MARK, str(sweep.folder))) and time.monotonic() - ended < LONG:
-        time.sleep(0.02)
-    lived = time.monotonic() - ended
+    lived, left = sweep.outlived(LONG)
     found.lived[last] = max(found.lived.get(last, 0.0), lived)
     if lived > SOON:
         found.faults.append(f"{last}: {lived:.1f} s after the end there was {left}")
@@ -124,26 +132,18 @@ def end(sweep: Sweep, process: subprocess.Popen[bytes], last: tuple[str, str], f
     return code
 
 
-def table(folder: Path) -> pd.DataFrame:
-    """Return the table of a sweep without the times of the clock."""
-    return judged(pd.read_parquet(folder / "runs.parquet"))
-
-
 def main() -> None:
     """Carry everything out and print a table; exit code 1 if something was amiss."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--runs", type=int, default=600)
-    parser.add_argument("--seed", type=int, default=101)
-    given = parser.parse_args()
+    given = options(__doc__, kills=100, runs=600, seed=101)
+    how = (f"0:{given.runs // 2}", "--workers", "2")
     source, found = random.Random(given.seed), Outcome()
     with tempfile.TemporaryDirectory(prefix="servobench-kills-") as scratch:
-        quiet = [Sweep(Path(scratch, f"quiet{k}"), names, given.runs) for k, names in enumerate(BATCHES)]
+        quiet = [Sweep(Path(scratch, f"quiet{k}"), names, *how, PEACE="1") for k, names in enumerate(BATCHES)]
         for each in quiet:
             assert end(each, each.start(), ("none", ""), found) == 0, found.faults
         while found.signals.total() < given.kills:
             batch, goal = found.tables % 2, min(given.kills, found.signals.total() + len(SIGNALS))
-            sweep = Sweep(Path(scratch, f"table{found.tables}"), BATCHES[batch], given.runs)
+            sweep = Sweep(Path(scratch, f"table{found.tables}"), BATCHES[batch], *how, PEACE="1")
             process = sweep.start()
             while found.signals.total() < goal and signalled(sweep, process, source, found):
                 process = process if process.poll() is None else sweep.start()
@@ -151,7 +151,7 @@ def main() -> None:
                 end(sweep, sweep.start(), ("last", ""), found)
             found.tables += 1
             try:
-                pd.testing.assert_frame_equal(table(sweep.folder), table(quiet[batch].folder), check_exact=True)
+                pd.testing.assert_frame_equal(sweep.table(), quiet[batch].table(), check_exact=True)
             except (AssertionError, OSError) as error:
                 found.faults.append(f"table {found.tables}: {error}")
     for key, count in sorted(found.signals.items()):
