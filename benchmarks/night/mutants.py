@@ -86,11 +86,10 @@ class Mutant:
         They are those of the statement with the fault, without the statements that stand in its body.
         """
         tree, node, _ = self._find()
-        bodies = [part for each in ast.walk(tree) if isinstance(each, ast.FunctionDef) for part in each.body]
-        around = [part for part in bodies if node in ast.walk(part)]
-        if not around:
+        holding = [each for each in ast.walk(tree) if isinstance(each, ast.stmt) and node in ast.walk(each)]
+        if not any(part in each.body for each in holding if isinstance(each, ast.FunctionDef) for part in holding):
             return None
-        inner = [each for each in ast.walk(around[-1]) if isinstance(each, ast.stmt) and node in ast.walk(each)][-1]
+        inner = holding[-1]
         below = [each.lineno for each in ast.walk(inner) if isinstance(each, ast.stmt) and each is not inner]
         return range(inner.lineno, min(below, default=inner.end_lineno + 1))
 

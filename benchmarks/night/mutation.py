@@ -3,12 +3,13 @@
 A seeded sample of the mutants of each group of modules (`night.mutants`) meets the group's unit tests; the score is the
 share that fails them. What survives is listed, with its line.
 
-Nothing on disk is changed. The tests are collected once, and run once to know which lines each reaches (`night.reach`).
-Each mutant is a forked process in which the functions of the module get the changed code; the tests that reach its line
-follow, the quickest first, until one fails. Where the fault is outside of functions, everything is imported anew from
-the changed tree, and all tests follow. That is why no tool of the trade is used here: cosmic-ray writes the mutants
-into the working tree and starts an interpreter for each, which costs more than most of these tests; mutmut finds
-modules by their paths, and the links in `.package` give them other names.
+Nothing on disk is changed. The tests are collected once, and each is run once to know which lines it reaches, it or its
+fixtures: no other test can notice a fault in a line. Each mutant is a forked process in which the functions of the
+module get the changed code; the tests that reach its line follow, the quickest first, until one fails. Where the fault
+is outside of functions, everything is imported anew from the changed tree, and all tests follow. That is why no tool of
+the trade is used here: cosmic-ray writes the mutants into the working tree and starts an interpreter for each, which
+costs more than most of these tests; mutmut finds modules by their paths, and the links in `.package` give them other
+names.
 """
 
 from __future__ import annotations
@@ -20,15 +21,18 @@ import random
 import resource
 import sys
 import tempfile
+import threading
+import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hypothesis import Phase, settings
 
 from night.children import answered, ended
 from night.mutants import ANEW, Changed, Imported, Mutant, mutants
-from night.reach import Reach, Reached, traced
 
 ROOT = Path(__file__).parents[2]
 
@@ -79,6 +83,13 @@ PROFILE = "mutants"  # of hypothesis: the examples of the suite; the first that 
 LEAST = 0.85  # score that is wanted
 
 
+class Reached(NamedTuple):
+    """What a test reaches."""
+
+    lines: set[tuple[str, int]]  # files and numbers
+    seconds: float  # of the processor, while lines are noted
+
+
 class Examination:
     """A plugin of pytest that meets mutants instead of running the collected tests once."""
 
@@ -95,9 +106,8 @@ class Examination:
         files = {str(sys.modules[each.name].__file__) for each in self._mutants if each.name in sys.modules}
         found = [answered(partial(self._trace, session, item, imported, files))[0] for item in session.items]
         self.sound = bool(found) and None not in found and not session.testsfailed
-        reach = Reach(found)
         for mutant in self._mutants if self.sound else []:
-            if not self._fails(session, mutant, imported, reach):
+            if not self._fails(session, mutant, imported, found):
                 self.survivors.append(str(mutant))
             self.tried += 1
             print(f"\r{self.tried} of {len(self._mutants)}, {len(self.survivors)} survived ", end="", flush=True)
@@ -112,14 +122,17 @@ class Examination:
         found = traced(files, lambda: _run(session, [item]))
         return None if session.testsfailed else found
 
-    def _fails(self, session: pytest.Session, mutant: Mutant, imported: Imported, reach: Reach) -> bool:
-        """Return whether one of the tests fails with a mutant."""
+    def _fails(self, session: pytest.Session, mutant: Mutant, imported: Imported, found: list[Reached]) -> bool:
+        """Return whether one of the tests fails with a mutant: those that reach it, the quickest first, else all."""
         lines = mutant.reach()
         file = str(sys.modules[mutant.name].__file__) if mutant.name in sys.modules else ""
-        tests = reach.tests(file, lines)
+        wanted = {(file, line) for line in lines or ()}
+        tests = [test for test, reached in enumerate(found) if lines is None or wanted & reached.lines]
         if not tests:
             return False
-        limit = int(max(MIN_CPU, CPU_MARGIN * reach.cost(tests))) + (ANEW_CPU if lines is None else 0)
+        tests.sort(key=lambda test: found[test].seconds)
+        cost = sum(found[test].seconds for test in tests)
+        limit = int(max(MIN_CPU, CPU_MARGIN * cost)) + (ANEW_CPU if lines is None else 0)
 
         def run() -> None:
             silence()
@@ -152,6 +165,26 @@ class Order:
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Sort the tests; new ones come last."""
         items.sort(key=lambda item: self._places.get(item.nodeid, len(self._places)))
+
+
+def traced(files: set[str], work: Callable[[], object]) -> Reached:
+    """Do something, and return which lines of some files it runs."""
+    lines = set()
+
+    def note(frame, event, _argument):
+        if event == "line":
+            lines.add((frame.f_code.co_filename, frame.f_lineno))
+        return note
+
+    def enter(frame, _event, _argument):
+        return note if frame.f_code.co_filename in files else None
+
+    begin = time.process_time()
+    threading.settrace(enter)
+    sys.settrace(enter)
+    work()
+    sys.settrace(None)
+    return Reached(lines, time.process_time() - begin)
 
 
 def silence() -> None:
