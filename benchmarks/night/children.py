@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable
 from multiprocessing import get_context
 
@@ -20,7 +21,12 @@ def ended(work: Callable[[], object]) -> int:
 def answered(work: Callable[[], object], seconds: float | None = None):
     """Return what a function returns in a child, None without an answer in time, and how the child ended."""
     ours, theirs = FORK.Pipe(duplex=False)
-    child = FORK.Process(target=lambda: theirs.send(work()))
+
+    def answer_and_leave() -> None:
+        theirs.send(work())
+        os._exit(0)  # whatever threads and handlers the work has left
+
+    child = FORK.Process(target=answer_and_leave)
     child.start()
     theirs.close()
     answer = None

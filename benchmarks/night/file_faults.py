@@ -10,7 +10,6 @@ and its tables must be those of an undisturbed batch, wall-clock columns aside, 
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import json
 import os
@@ -20,20 +19,19 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
 import zipfile
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
 
-from kit.command import PACKAGE, judged
+from kit.command import PACKAGE, carried_out, judged
 from kit.foreign_fmu import packed
 from kit.toy import TRAINING, plant_spec
+from measuring import options
+from night.children import answered, ended
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.integrity import examine
@@ -49,15 +47,13 @@ from servobench.plant.fmu.archive import extract_fmu
 
 SOURCE = Path(__file__).with_name("file_faults.c")
 MODES = {"KILL": 1, "TORN": 2, "POWER": 3, "EIO": 4, "ENOSPC": 5}
-SETTINGS = {
-    "random": {"duration": 0.2},
-    "run": {"lost_after": 0.05},
-    "kinematic": {"sensing": {"drop_probability": 0.05}},
-}
+SENSING = {"drop_probability": 0.05}
+SETTINGS = {"random": {"duration": 0.2}, "run": {"lost_after": 0.05}, "kinematic": {"sensing": SENSING}}
 
 
 def build(folder: Path) -> Path:
     """Compile the library and return its path."""
+    folder.mkdir(exist_ok=True)
     library = folder / "file_faults.so"
     command = ["gcc", "-O1", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-ldl"]
     subprocess.run(command, check=True, timeout=60)
@@ -72,12 +68,9 @@ def start(folder: Path, *arguments: str, timeout: float | None = None) -> dict[s
         "LD_PRELOAD": str(library),
         "BREAK_LIBRARY": str(library),
         "BREAK_BELOW": str(folder / "point"),
-        "PYTHONPATH": os.pathsep.join(
-            [str(PACKAGE), str(PACKAGE.parent / "tests"), str(PACKAGE.parent / "benchmarks")]
-        ),
+        "PYTHONPATH": os.pathsep.join(str(PACKAGE.parent / name) for name in (".package", "tests", "benchmarks")),
     }
-    command = [sys.executable, "-m", "night.file_faults", *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
+    done = carried_out(sys.executable, "-m", "night.file_faults", *arguments, env=environment, timeout=timeout)
     assert done.returncode == 0, done.stdout + done.stderr
     figures = dict(json.loads(done.stdout.splitlines()[-1]))
     return figures | ({"why": done.stderr[-3000:]} if figures["failed"] else {})
@@ -87,13 +80,7 @@ def start_each(modes: list[str], arguments: list[str]) -> dict[str, object]:
     """Break in each way in a process of its own, as many at a time as there are processors; return all figures."""
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
-
-        def of_mode(mode: str) -> dict[str, object]:
-            place = Path(folder, mode)
-            place.mkdir()
-            return start(place, *arguments, "--modes", mode)
-
-        found = list(pool.map(of_mode, modes))
+        found = list(pool.map(lambda mode: start(Path(folder, mode), *arguments, "--modes", mode), modes))
     added = {name: sum((each[name] for each in found[1:]), found[0][name]) for name in ("points", "failed")}
     why = "\n".join(str(each["why"]) for each in found if each["failed"])
     minutes = round((time.monotonic() - begin) / 60.0, 2)
@@ -106,34 +93,20 @@ def campaign(steps: bool, controllers: tuple[str, ...], runs: int) -> Campaign:
     return Campaign(SweepPlan(batch).cells(), Settings(SETTINGS), steps)
 
 
-class Subject(Protocol):
-    """What is done below a folder, and can be done again after it was broken."""
-
-    def carry_out(self, point: Path, *, resume: bool = False) -> None:
-        """Do it, or what is left of it."""
-
-    def outcome(self, point: Path) -> object:
-        """Return what came of it; raise AssertionError where the folder is not as it should be."""
-
-    def look(self, point: Path) -> None:
-        """Read what an interrupted attempt has left."""
-
-    def refusal(self, error: Exception) -> str:
-        """Return the line that a user gets; empty for an error that none should end with."""
-
-
 @dataclass(frozen=True)
 class Batches:
-    """A batch into a results folder."""
+    """A batch into a results folder, which can be resumed after it was broken."""
 
     batch: Campaign
     block: int = 16  # runs that advance together at most
 
     def carry_out(self, point: Path, *, resume: bool = False) -> None:
+        """Do it, or what is left of it."""
         bounds = Bounds(isolate=False)
         carry_out(self.batch, point, Execution(workers=1, block=self.block, resume=resume, bounds=bounds))
 
     def outcome(self, point: Path) -> list[object]:
+        """Return the tables; raise AssertionError where the folder is not as it should be."""
         found = examine(point)
         assert not found.findings, found.findings
         left = {path.name for path in point.iterdir()} - {results.STEPS, results.RUNS, results.FAILURES, NETWORKS}
@@ -142,16 +115,18 @@ class Batches:
         return [(list(table.columns), pd.util.hash_pandas_object(table).tolist()) for table in map(judged, tables)]
 
     def look(self, point: Path) -> None:
+        """Read what an interrupted attempt has left."""
         if not is_unused(point) and results.part_indices(point):
             results.load_runs(point)
 
     def refusal(self, error: Exception) -> str:
+        """Return the line that a user gets; empty for an error that none should end with."""
         line = str(error.strerror if isinstance(error, UnwritableFolder) else error)
         return line if line.startswith("results folder") else ""
 
 
 class Caches:
-    """An FMU is extracted and networks are trained, each into its cache; whoever comes next has both whole."""
+    """As `Batches`: an FMU and networks, each into its cache; whoever comes next has both whole."""
 
     def carry_out(self, point: Path, *, resume: bool = False) -> None:
         os.environ["XDG_CACHE_HOME"] = str(point)
@@ -187,7 +162,7 @@ class Breaker:
         failed: what went wrong, a line each.
     """
 
-    def __init__(self, folder: Path, subject: Subject) -> None:
+    def __init__(self, folder: Path, subject: Batches | Caches) -> None:
         """Carry it out once, undisturbed."""
         self._point, self._subject = folder / "point", subject
         self._library = ctypes.CDLL(os.environ["BREAK_LIBRARY"])
@@ -199,27 +174,25 @@ class Breaker:
     def operations(self) -> int:
         """Return how many operations an undisturbed attempt has."""
         self._clear()
-        read, write = os.pipe()
 
-        def count() -> None:
+        def count() -> int:
             self._library.break_at(-1, MODES["EIO"])
             self._subject.carry_out(self._point)
             self._library.broken_count.restype = ctypes.c_long
-            os.write(write, str(self._library.broken_count()).encode())
+            return self._library.broken_count()
 
-        assert self._in_child(count) == 0
-        os.close(write)
-        with os.fdopen(read) as pipe:
-            return int(pipe.read())
+        found, code = answered(count)
+        assert code == 0
+        return found
 
     def break_at(self, number: int, mode: str) -> None:
         """Break one operation, and go on."""
         self._clear()
         where = f"operation {number}, {mode}"
-        status = self._in_child(lambda: self._broken(number, mode))
+        status = ended(lambda: self._broken(number, mode))
         if status not in (0, -signal.SIGKILL):
             self.failed.append(f"{where}: the process ended with {status}")
-        elif self._in_child(self._resumed) != 0:
+        elif ended(self._resumed) != 0:
             self.failed.append(f"{where}: it could not be resumed")
         self.points += 1
 
@@ -241,34 +214,22 @@ class Breaker:
         shutil.rmtree(self._point, ignore_errors=True)
         self._point.mkdir()
 
-    @staticmethod
-    def _in_child(work: Callable[[], None]) -> int:
-        """Do something in a child of this process and return its exit code, or the negative number of a signal."""
-        child = os.fork()
-        if child:
-            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        try:
-            work()
-        except BaseException:  # noqa: BLE001 - whatever it is, the parent must learn it
-            traceback.print_exc()
-            os._exit(3)
-        os._exit(0)
-
 
 def main() -> None:
     """Break a batch as the arguments say, and print figures as JSON; exit code 1 if a point failed."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--controllers", default="constant,broyden")
-    parser.add_argument("--block", type=int, default=16, help="runs that advance together at most")
-    parser.add_argument("--caches", action="store_true", help="break caches of an FMU and of networks, and no batch")
-    parser.add_argument("--steps", action="store_true", help="keep the table of steps, as compare does")
-    parser.add_argument("--every", type=int, default=1, help="break each so many-th operation only")
-    parser.add_argument("--modes", default=",".join(MODES))
-    chosen = parser.parse_args()
+    chosen = options(
+        __doc__,
+        runs=50,
+        controllers="constant,broyden",
+        block=(16, "runs that advance together at most"),
+        caches={"action": "store_true", "help": "break caches of an FMU and of networks, and no batch"},
+        steps={"action": "store_true", "help": "keep the table of steps, as compare does"},
+        every=(1, "break each so many-th operation only"),
+        modes=",".join(MODES),
+    )
     if "BREAK_LIBRARY" not in os.environ:
         figures = start_each(chosen.modes.split(","), sys.argv[1:])
-        sys.stdout.write(json.dumps(figures, indent=1) + "\n")
+        print(json.dumps(figures, indent=1))
         sys.exit(bool(figures["failed"]))
     folder = Path(os.environ["BREAK_LIBRARY"]).parent
     batch = Batches(campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs), chosen.block)
@@ -277,8 +238,7 @@ def main() -> None:
     for mode in chosen.modes.split(","):
         for number in range(1 + 7 * list(MODES).index(mode) % chosen.every, total + 1, chosen.every):
             breaker.break_at(number, mode)
-    figures = {"operations": total, "points": breaker.points, "failed": breaker.failed}
-    sys.stdout.write(json.dumps(figures) + "\n")
+    print(json.dumps({"operations": total, "points": breaker.points, "failed": breaker.failed}))
 
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ code is then 1. Batches have seeds of their own: `--first` goes on where another
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import random
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -27,6 +27,7 @@ from types import FrameType
 
 import numpy as np
 
+from measuring import options
 from night.parsers import PARSERS, Parser
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -55,10 +56,10 @@ def drawn(parser: Parser, source: random.Random) -> str | bytes:
 
     if source.random() < 0.25:
         return (b"" if raw else "").join(piece() for _ in range(source.randrange(7)))
-    changes = (
-        (source.choice(CHANGES), source.random(), source.choice(LENGTHS), piece()) for _ in range(source.randint(1, 4))
-    )
-    return _change(source.choice(parser.examples), changes)
+    number, text = source.randint(1, 4), source.choice(parser.examples)
+    for _ in range(number):
+        text = _change(text, source.choice(CHANGES), source.random(), source.choice(LENGTHS), piece())
+    return text
 
 
 def _letter(source: random.Random) -> str:
@@ -67,47 +68,30 @@ def _letter(source: random.Random) -> str:
     return chr(code if code < 0xD800 else code + 0x800)
 
 
-def _insert(text, place, _, piece):
-    return text[:place] + piece + text[place:]
+CHANGES = ("insert", "replace", "replace", "delete", "repeat", "cut", "flip", "flip", "move")
 
 
-def _replace(text, place, length, piece):
-    return text[:place] + piece + text[place + length :]
-
-
-def _delete(text, place, length, _):
-    return text[:place] + text[place + length :]
-
-
-def _repeat(text, place, length, _):
-    return text[:place] + text[place : place + length] * 3 + text[place + length :]
-
-
-def _cut(text, place, *_):
-    return text[:place]
-
-
-def _flip(text, place, length, _):
+def _change(text, change, share, length, piece):
+    """Change a text, or bytes, at a share of its length."""
+    place = int(share * len(text))
+    head, middle, tail = text[:place], text[place : place + length], text[place + length :]
+    match change:
+        case "insert":
+            return head + piece + middle + tail
+        case "replace":
+            return head + piece + tail
+        case "delete":
+            return head + tail
+        case "repeat":
+            return head + middle * 3 + tail
+        case "cut":
+            return head
+        case "move":
+            return tail + middle + head
+    flipped, rest = text[place : place + 1], text[place + 1 :]
     if isinstance(text, bytes):
-        return text[:place] + bytes([byte ^ (1 << length % 8) for byte in text[place : place + 1]]) + text[place + 1 :]
-    return (
-        text[:place]
-        + "".join(chr(ord(each) ^ (1 << length % 7)) for each in text[place : place + 1])
-        + text[place + 1 :]
-    )
-
-
-def _move(text, place, length, _):
-    return text[place + length :] + text[place : place + length] + text[:place]
-
-
-CHANGES = (_insert, _replace, _replace, _delete, _repeat, _cut, _flip, _flip, _move)
-
-
-def _change(text, changes):
-    for change, share, length, piece in changes:
-        text = change(text, int(share * len(text)), length, piece)
-    return text
+        return head + bytes(byte ^ (1 << length % 8) for byte in flipped) + rest
+    return head + "".join(chr(ord(each) ^ (1 << length % 7)) for each in flipped) + rest
 
 
 def check(parser: Parser, given: str | bytes, folder: Path) -> bool:
@@ -166,11 +150,8 @@ def limited() -> Iterator[None]:
 
 def main() -> int:
     """Carry the campaign out."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--inputs", type=int, default=1_000_000, help="number of inputs over all parsers")
-    options.add_argument("--first", type=int, default=0, help="seed of the first batch")
-    options.add_argument("--only", default="", help="comma-separated names of parsers")
-    chosen = options.parse_args()
+    inputs, first = (1_000_000, "number of inputs over all parsers"), (0, "seed of the first batch")
+    chosen = options(__doc__, inputs=inputs, first=first, only=("", "comma-separated names of parsers"))
     names = chosen.only.split(",") if chosen.only else list(PARSERS)
     shares = sum(PARSERS[name].share for name in names)
     found, total, begin = 0, 0, time.monotonic()
@@ -182,11 +163,12 @@ def main() -> int:
             total += tried.counts.total()
             found += len(tried.breaks)
             taken, refused = tried.counts[True], tried.counts[False]
-            say(f"{name}: {taken} taken, {refused} refused, {len(tried.breaks)} broken, longest {tried.longest:.2f} s")
-            for text in tried.breaks.values():
-                say(f"    {text}")
+            line = (
+                f"{name}: {taken} taken, {refused} refused, {len(tried.breaks)} broken, longest {tried.longest:.2f} s"
+            )
+            print(line, *tried.breaks.values(), sep="\n    ", flush=True)
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    say(f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s, at most {largest:.0f} MB in memory")
+    print(f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s, at most {largest:.0f} MB in memory")
     return min(found, 1)
 
 
@@ -200,19 +182,13 @@ class Tried:
 
 
 def fuzz(name: str, wanted: int, first: int, scratch: Path) -> Tried:
-    """Give a parser inputs, in batches."""
-    tried, batch = Tried(), first
-    while tried.counts.total() < wanted:
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            run_batch(name, min(BATCH, wanted - tried.counts.total()), batch, Path(folder), tried)
-        batch += 1
-    return tried
-
-
-def run_batch(name: str, size: int, number: int, folder: Path, tried: Tried) -> None:
-    """Give a parser `size` inputs and note the outcomes."""
-    parser, source = PARSERS[name], random.Random(f"{name} {number}")
-    for _ in range(size):
+    """Give a parser inputs and note the outcomes; each batch has a seed and a folder of its own."""
+    parser, tried, folder = PARSERS[name], Tried(), scratch / "batch"
+    for number in range(wanted):
+        if number % BATCH == 0:
+            source = random.Random(f"{name} {first + number // BATCH}")
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
         value = drawn(parser, source)
         begin = time.process_time()
         try:
@@ -222,12 +198,7 @@ def run_batch(name: str, size: int, number: int, folder: Path, tried: Tried) -> 
             kind = "".join(each for each in str(error)[:60] if not each.isdigit())
             tried.breaks.setdefault(kind, f"{error}  <-  {value!r}"[:2000])
         tried.longest = max(tried.longest, time.process_time() - begin)
-
-
-def say(text: str) -> None:
-    """Write a line at once."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    return tried
 
 
 if __name__ == "__main__":

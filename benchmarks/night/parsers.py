@@ -184,9 +184,7 @@ def part_name(name: str, folder: Path) -> None:
 
 def other_table(text: str, folder: Path) -> None:
     """Read a folder with a table of somebody beside those of the batch."""
-    place = _folder(folder / "out", {**files(), "mine.csv": text})
-    for _ in results.other_tables(place):
-        pass
+    list(results.other_tables(_folder(folder / "out", {**files(), "mine.csv": text})))
 
 
 def lock(text: str, folder: Path) -> None:
@@ -233,7 +231,7 @@ def files(*, parts: bool = False) -> dict[str, bytes]:
 def _read_folder(folder: Path) -> None:
     """Read a folder by everything that reads one, and raise the first refusal at the end."""
     refusals = []
-    readers: tuple[Callable[[Path], object], ...] = (
+    readers = (
         results.read_manifest, results.load_runs, results.load_steps, results.finished_runs, examine,
         describe_settings, _judged, results.collect,
     )  # fmt: skip

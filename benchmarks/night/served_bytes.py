@@ -5,7 +5,6 @@ PYTHONPATH=tests:benchmarks python -m night.served_bytes --inputs 100000
 
 from __future__ import annotations
 
-import argparse
 import logging
 import math
 import random
@@ -17,6 +16,7 @@ from collections import Counter
 from contextlib import suppress
 
 from kit.served import SPEED, Bytes, packed, served
+from measuring import options
 from servobench.harness.serve.server import PORTS
 
 NAMES = (*SPEED, "actual_q", "timestamp", "input_int_register_24", "nonsense", "standard_digital_output", "", "é")
@@ -77,10 +77,7 @@ def knock(address, port, data, number):
 
 def main() -> None:
     """Print a table by port, and end with exit code 1 if something was wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--inputs", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = options(__doc__, inputs=100_000, seed=0)
     found, logged = [], []
     handler = logging.Handler()
     handler.emit = lambda record: logged.append(f"{record.getMessage()} {record.exc_info and record.exc_info[1]!r}")

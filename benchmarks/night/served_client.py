@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import faulthandler
-import sys
 import time
 from dataclasses import dataclass
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
 
 import servobench
 
-_SPEC = spec_from_file_location("on_a_ur", Path(__file__).parents[2] / "docs" / "examples" / "on_a_ur.py")
-on_a_ur = module_from_spec(_SPEC)
-sys.modules["on_a_ur"] = on_a_ur
-_SPEC.loader.exec_module(on_a_ur)
+ON_A_UR = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'on_a_ur.py'}:UR"
 
 
 @dataclass(frozen=True)
@@ -63,5 +58,5 @@ def run(host: str, fault: str, at: int, place: str) -> None:
         "run": {"lost_after": 0.1},
         "target": {"duration": 3.0},
     }
-    done = servobench.run(Swing, on_a_ur.UR, task="target", mismatch="none", robot="ur5e", settings=settings)
+    done = servobench.run(Swing, ON_A_UR, task="target", mismatch="none", robot="ur5e", settings=settings)
     Path(place).write_text(f"{done.row['status']}: {done.row['reason']}", encoding="utf-8")

@@ -8,7 +8,6 @@ its packets. The server in this process notes every command that reaches the pla
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -28,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from kit.served import fresh_address, served, waited_for
+from measuring import options
 from night import served_client
 from servobench.harness.serve.server import PORTS
 
@@ -216,11 +216,7 @@ def inject(fault, relay, server, client):
 
 def main() -> None:
     """Print a table by kind, and end with exit code 1 if something was wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--faults", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kind", help="this kind alone")
-    given = parser.parse_args()
+    given = options(__doc__, faults=500, seed=0, kind=("", "this kind alone"))
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["night.served_client"])
     kinds, draw = (*BY_CONTROLLER, *BY_RELAY, *BY_FORCE), random.Random(given.seed)

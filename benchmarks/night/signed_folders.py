@@ -10,14 +10,11 @@ exported table that is not the table within. `--first N --folders 1` repeats the
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
 import resource
-import select
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -33,6 +30,8 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from kit.writes import noting
+from measuring import options
+from night.children import answered
 from night.fuzzing import drawn
 from night.parsers import Parser
 from servobench.harness.batch import results
@@ -58,12 +57,8 @@ COMMANDS: Final = {  # and how often, relative to the others
     f"record {{}} --run {RUN} --kinds snapshots": 0.1,
 }  # fmt: skip
 EXPORT: Final = "export {} --out out/csv"
-UNCHANGED: Final = (
-    "statistics {}",
-    "statistics {} --json",
-    "statistics {} --latex",
-    EXPORT,
-)  # unsigned: as before, or refused
+UNCHANGED: Final = ("statistics {}", "statistics {} --json", "statistics {} --latex", EXPORT)
+"""Commands whose output of an unsigned folder is as before; or they refuse it."""
 HANG: Final = 90.0  # [s] for the commands of a folder
 CPU: Final = 40  # [s] of the processor, likewise
 SHOWN: Final = 200  # faults that are printed at most
@@ -112,9 +107,8 @@ def change_table(folder: Path, source: random.Random) -> None:
     elif kind == 5:
         table = table.append_column(source.choice([*PAYLOADS, name]), pa.array([value] * len(cells)))
     elif kind == 6:
-        table = source.choice(
-            (table.slice(0, 0), table.slice(1), pa.concat_tables([table, table]), table.take([0] * 9))
-        )
+        other = (table.slice(0, 0), table.slice(1), pa.concat_tables([table, table]), table.take([0] * 9))
+        table = source.choice(other)
     else:
         swapped = source.choice(cells)
         table = table.set_column(index, name, pa.array([swapped] * len(cells), table[name].type))
@@ -196,11 +190,8 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     """Change a folder, give it to commands, and return the faults; in a child."""
     source = random.Random(number)
     good = source.choice(goods)
-    folder = place / "home" / "folder"
-    for name in ("home", "out", "temporary", "cache"):
-        (place / name).mkdir(parents=True)
+    folder = laid_out(good, place)
     (place / "home" / "victim.csv").write_text("precious")
-    shutil.copytree(good, folder)
     shutil.copytree(good.parent / "other", place / "other")
     for change in source.choices(CHANGES, k=source.choice((1, 1, 2, 3))):
         try:
@@ -210,7 +201,6 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     signed = source.random() < 0.8
     if signed:
         sign(folder)
-    os.chdir(place)
     tempfile.tempdir = str(place / "temporary")
     os.environ["XDG_CACHE_HOME"] = str(place / "cache")
     faults, changed = [], not (signed or _same_files(folder, good))
@@ -220,6 +210,15 @@ def attempt(number: int, goods: list[Path], place: Path, wanted: dict[str, objec
     if (place / "home" / "victim.csv").read_text() != "precious" or len(list((place / "home").iterdir())) > 2:
         faults.append(("", "outside: the home of the folder was changed"))
     return faults
+
+
+def laid_out(good: Path, place: Path) -> Path:
+    """Copy a good folder among folders for what commands write, go there, and return the copy."""
+    shutil.rmtree(place, ignore_errors=True)
+    for name in ("home", "out", "temporary", "cache"):
+        (place / name).mkdir(parents=True)
+    os.chdir(place)
+    return Path(shutil.copytree(good, place / "home" / "folder"))
 
 
 def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *, changed: bool) -> list[str]:
@@ -232,31 +231,25 @@ def _faults(command: str, folder: Path, good: Path, wanted: dict[str, object], *
     faults = [f"outside: {each}" for each in outside if each[1] != os.devnull]
     if isinstance(code, str) or "Traceback" in error:
         faults.append(code if isinstance(code, str) else f"trace: {error[-300:]}")
-    elif code == 2 and (
-        error.count("servobench: ") != 1 or error.count("\n") > 2
-    ):  # a word of an unfinished batch first
-        faults.append(f"lines: {error[-300:]!r}")
+    elif code == 2:
+        if error.count("servobench: ") != 1 or error.count("\n") > 2:  # a word of an unfinished batch first
+            faults.append(f"lines: {error[-300:]!r}")
     elif code == 0 and changed and command.startswith("verify"):
         faults.append("silent: verify takes changed files")
-    elif (
-        code == 0
-        and changed
-        and command in UNCHANGED
-        and f"{SUMS} is missing" not in out + error  # nothing vouches for the tables then
-        and _output(command, out, place) != wanted[f"{good}{command}"]
-    ):
-        faults.append("silent: another output of a changed folder")
-    elif code == 0 and command == EXPORT and not _equal_tables(folder, place / "out" / "csv"):
-        faults.append("silent: an exported table is not that of the folder")
+    elif code == 0:
+        vouched = changed and command in UNCHANGED and f"{SUMS} is missing" not in out + error
+        if vouched and _output(command, out, place) != wanted[f"{good}{command}"]:
+            faults.append("silent: another output of a changed folder")
+        elif command == EXPORT and not _equal_tables(folder, place / "out" / "csv"):
+            faults.append("silent: an exported table is not that of the folder")
     return faults
 
 
 def _captured(arguments: list[str], place: Path) -> tuple[int | str, str, str]:
     streams = [place / "temporary" / f"stream{number}" for number in (1, 2)]
     for number, stream in enumerate(streams, 1):
-        file = os.open(stream, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(file, number)
-        os.close(file)
+        with stream.open("wb") as file:
+            os.dup2(file.fileno(), number)
     code = call(arguments)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -269,9 +262,11 @@ def _same_files(folder: Path, good: Path) -> bool:
     vouched = [line.split("  ", 1)[1] for line in (good / SUMS).read_text().splitlines()]
     lost = [name for name in vouched if name.endswith(f".{results.RUNS}") and not os.path.lexists(folder / name)]
     names = [name for name in (*vouched, SUMS) if (good / name).is_file() and name not in lost]
-    return all(
-        (folder / name).is_file() and (folder / name).read_bytes() == (good / name).read_bytes() for name in names
-    )
+    return all(_content(folder / name) == _content(good / name) for name in names)
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
 
 
 def _output(command: str, out: str, place: Path) -> object:
@@ -294,35 +289,24 @@ def _equal_tables(folder: Path, exported: Path) -> bool:
 
 def in_child(work: Callable[[], object]) -> list[tuple[str, str]]:
     """Return what a function of a child of this process returns, or how the child ended."""
-    read, write = os.pipe()
-    child = os.fork()
-    if not child:
+
+    def limited() -> object:
         os.setsid()
         resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU))
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
         try:
-            answer = work()
+            return work()
         except BaseException:  # noqa: BLE001 - a fault of this tool, which must be seen
-            answer = [("", f"tool: {traceback.format_exc()}")]
-        os.write(write, json.dumps(answer).encode())
-        os._exit(0)
-    os.close(write)
-    ready, _, _ = select.select([read], [], [], HANG)
-    if not ready:
-        os.kill(child, signal.SIGKILL)
-    with os.fdopen(read, "rb") as pipe:
-        text = pipe.read() if ready else b""
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    return json.loads(text) if text else [("", f"hang: {HANG:g} s or {CPU} s of the processor; status {status}")]
+            return [("", f"tool: {traceback.format_exc()}")]
+
+    found, status = answered(limited, HANG)
+    return [("", f"hang: {HANG:g} s or {CPU} s of the processor; status {status}")] if found is None else found
 
 
 def main() -> None:
     """Carry everything out and print counts; exit code 1 if there was a fault."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folders", type=int, default=10_000)
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
-    given = parser.parse_args()
+    given = options(__doc__, folders=10_000, first=(0, "number of the first one"))
     began, counts, shown = time.monotonic(), Counter[str](), 0
     with tempfile.TemporaryDirectory(prefix="servobench-signed-") as scratch:
         place = Path(scratch)
@@ -338,7 +322,6 @@ def main() -> None:
                 counts[fault.partition(":")[0]] += 1
                 if (shown := shown + 1) <= SHOWN:
                     print(f"{number}: {command}: {fault}", flush=True)
-            shutil.rmtree(place / "point", ignore_errors=True)
             if number % 500 == 0:
                 print(f"{number}: {time.monotonic() - began:.0f} s", flush=True)
     print(f"{given.folders} folders, {2 * given.folders} commands, {time.monotonic() - began:.0f} s: {dict(counts)}")
@@ -346,12 +329,7 @@ def main() -> None:
 
 
 def _good_output(command: str, good: Path, place: Path) -> object:
-    shutil.rmtree(place, ignore_errors=True)
-    folder = place / "home" / "folder"
-    (place / "temporary").mkdir(parents=True)
-    shutil.copytree(good, folder)
-    os.chdir(place)
-    code, out, error = _captured(command.format(folder).split(), place)
+    code, out, error = _captured(command.format(laid_out(good, place)).split(), place)
     assert code == 0, error
     return _output(command, out, place)
 

@@ -85,13 +85,12 @@ def main() -> int:
             with tempfile.TemporaryDirectory(prefix="servobench-loops-") as folder:
                 found, wanted = both(loop, write(loop, Path(folder)))
         except ConfigurationError as error:
-            sys.stdout.write(f"{' '.join(loop)}: {error}\n")
+            print(f"{' '.join(loop)}: {error}")
             wrong += loop.sensing not in UNEXPORTED
             continue
         wrong += not agree(loop, found, wanted)
         apart, moved = np.abs(found - wanted).max(), np.ptp(wanted, axis=0).max()
-        sys.stdout.write(f"{' '.join(loop)}: {len(wanted)} periods, {apart:.1e} apart, moved by {moved:.2f}\n")
-        sys.stdout.flush()
+        print(f"{' '.join(loop)}: {len(wanted)} periods, {apart:.1e} apart, moved by {moved:.2f}", flush=True)
     return int(wrong > 0)
 
 

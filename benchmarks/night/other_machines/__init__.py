@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import subprocess
 import sys
 import zipfile
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kit.command import carried_out
 from servobench.fmus.compiler import PLATFORMS, Platform, this_platform
 from servobench.fmus.product import Product
 
@@ -93,16 +93,12 @@ def drive(
     target = [] if machine is None else ["-target", platform.zig_target]
     system = [] if platform.suffix == ".dll" else ["-ldl"]
     options = [f"-DFMI_VERSION={version}", "-I", str(unpacked / "sources"), "-O2", "-o", str(program)]
-    done = subprocess.run(
-        [*build, *target, str(HERE / "drive.c"), *options, *system], capture_output=True, text=True, check=False
-    )
+    done = carried_out(*build, *target, HERE / "drive.c", *options, *system)
     assert done.returncode == 0, done.stderr[:2000]
     head = np.array([step, first, inputs.shape[1]])
     (unpacked / "inputs").write_bytes(np.concatenate([head, np.ravel(inputs)]).astype("<f8").tobytes())
     environment = {**os.environ, "WINEPREFIX": str(home or unpacked), "WINEDEBUG": "-all", "DISPLAY": ""}
     words = [*command, f"./{program.name}", f"./{library.relative_to(unpacked).as_posix()}", "inputs", "outputs"]
-    done = subprocess.run(
-        words, cwd=unpacked, env=environment, capture_output=True, text=True, check=False, timeout=600, errors="replace"
-    )
+    done = carried_out(*words, cwd=unpacked, env=environment, timeout=600, errors="replace")
     assert done.returncode == 0, f"{words}: exit code {done.returncode}: {done.stderr[:2000]}"
     return np.frombuffer((unpacked / "outputs").read_bytes(), "<f8").reshape(len(inputs), -1)

@@ -9,6 +9,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from kit.command import carried_out
 from kit.controller_fmus import recorded
 from servobench.fmus.export import ExportOptions, product
 from servobench.fmus.product import Product
@@ -27,9 +28,8 @@ def can_sanitize() -> bool:
         return False
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "main.c").write_text("int main(void) { return 0; }\n")
-        build = [compiler, *SANITIZED, "main.c", "-o", "main"]
-        built = subprocess.run(build, cwd=folder, capture_output=True, check=False)
-        return built.returncode == 0 and subprocess.run([f"{folder}/main"], check=False).returncode == 0
+        built = carried_out(compiler, *SANITIZED, "main.c", "-o", "main", cwd=folder)
+        return built.returncode == 0 and carried_out(f"{folder}/main").returncode == 0
 
 
 def arm(version: int) -> Product:
@@ -64,8 +64,7 @@ def run(program: Path, calls: int, seed: int) -> tuple[int, int]:
     Raises:
         AssertionError: a sanitizer found something.
     """
-    command = [program, str(calls), str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace", timeout=TIMEOUT)
+    done = carried_out(program, calls, seed, errors="replace", timeout=TIMEOUT)
     assert done.returncode == 0, f"seed {seed}: {done.stderr[:3000]}"
     made, refused = re.fullmatch(r"(\d+) calls, (\d+) refused\n", done.stdout).groups()
     return int(made), int(refused)
