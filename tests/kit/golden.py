@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ VARIANTS: tuple[Mapping[str, str], ...] = (
 )
 
 
-def golden_runs(plant: str, controllers: tuple[str, ...] = tuple(CONTROLLERS)) -> pd.DataFrame:
+def golden_runs(plant: str, controllers: Sequence[str]) -> pd.DataFrame:
     """Make the runs on a plant and return the rows of the table, without the spread."""
     settings: dict[str, dict[str, Any]] = {TASK: {"duration": DURATIONS[plant]}, "run": {"period": PERIOD}}
     if plant in RENDERED:
@@ -73,11 +73,13 @@ def changelog_line() -> str:
     return f"Golden runs: `{hashlib.sha256(TABLE.read_bytes()).hexdigest()[:16]}`."
 
 
-def made_apart(folder: Path, plants: Iterable[str] = DURATIONS, **environment: str) -> pd.DataFrame:
+def made_apart(
+    folder: Path, plants: Iterable[str] = DURATIONS, controllers: Iterable[str] = CONTROLLERS, **environment: str
+) -> pd.DataFrame:
     """Return the table as a process of its own makes it; its first one in a folder trains networks with `KERNEL`."""
     path = folder / "made.csv"
     own = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), **KERNEL, **environment}
-    subprocess.run([sys.executable, __file__, str(path), *plants], env=own, check=True)
+    subprocess.run([sys.executable, __file__, str(path), ",".join(controllers), *plants], env=own, check=True)
     return pd.read_csv(path)
 
 
@@ -101,6 +103,7 @@ def renew() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        pd.concat([golden_runs(plant) for plant in sys.argv[2:]]).to_csv(sys.argv[1], index=False)
+        path, controllers, *plants = sys.argv[1:]
+        pd.concat([golden_runs(plant, controllers.split(",")) for plant in plants]).to_csv(path, index=False)
     else:
         renew()
