@@ -10,8 +10,9 @@ import pytest
 
 from kit.nightly import some
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.episode import carry_out_together
 from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.resolution import resolve
 
 NEVER = math.nan
 SEEDS = (704, 707)  # whose settling times five kinds of processors give alike to a period or a hundredth
@@ -49,9 +50,9 @@ WORLDS = {
 @pytest.mark.parametrize("world", some(WORLDS, "severe", "camera_turned_by_120_degrees", "camera_moved_by_45_degrees"))
 def test_methods_settle_as_soon_as_they_did(world, controller):
     mismatch, latency, duration, wanted = WORLDS[world]
-    settings, came = Settings({"random": {"duration": duration}}), []
-    for seed in SEEDS:
-        request = RunRequest("kinematic", controller, "random", mismatch, seed, {"latency": latency})
-        came.append(run_experiment(request, settings, steps=False).row["settling_time_s"])
+    settings = Settings({"random": {"duration": duration}})
+    requests = [RunRequest("kinematic", controller, "random", mismatch, seed, {"latency": latency}) for seed in SEEDS]
+    results = carry_out_together([resolve(request, settings) for request in requests])
+    came = [result.row["settling_time_s"] for result in results]
     one_period = 1.001 * RunSettings().period
     assert came == pytest.approx(wanted[METHODS.index(controller)], abs=one_period, rel=0.01, nan_ok=True)
