@@ -151,20 +151,19 @@ def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(m
 
 
 def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_hold(tmp_path):
-    plan = plan_of("broyden:published", trials=2, studies=2, search=1)
+    plan = replace(plan_of("broyden:published", trials=2, studies=2, search=1), runs=TuningSet(robots=1))
     one, two = carried_out(tmp_path / "one", plan), carried_out(tmp_path / "two", plan, workers=2)
     written, again = write_results(tmp_path / "one", one), write_results(tmp_path / "two", two)
     assert written == again
     (tuned,) = written.values()
     assert read_tuned(tmp_path / "one" / "broyden.published.toml") == tuned
-    assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == SMALL
-    assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (16, 48)
+    assert TuningSet(tuned.plants, tuned.robots, tuned.offset) == plan.runs
+    assert (tuned.runs_a_trial, tuned.runs_of_second_set) == (8, 24)
     assert [(each.seed, each.trials, each.search_points) for each in tuned.studies] == [(0, 2, 1), (1, 2, 1)]
     on_second = [tuned.second_score_of_defaults, *(each.second_score for each in tuned.studies)]
     assert tuned.second_score <= min(on_second), "the values in use stay unless a study is better"
     assert tuned.settings == nested_settings(tuned_point(find_tunable("broyden:published")))
-    first = SMALL.checked()
-    (costs,) = [one[0].ledger.costs(tuned.settings)]
+    first, costs = plan.runs.checked(), one[0].ledger.costs(tuned.settings)
     assert tuned.checked_score == pytest.approx(score([costs[index] for index in first]))
 
 
