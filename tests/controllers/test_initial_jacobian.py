@@ -110,40 +110,35 @@ def test_a_controller_says_that_it_probes_and_servoes_afterwards():
     assert np.linalg.norm(plant.truth().feature - goal) < 0.005
 
 
-def test_the_nominal_model_is_evaluated_at_the_start():
-    knowledge = RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :])
-    provider = initial_jacobian(InitialConfig(), knowledge)
-    assert provider.immediate
-    state = provider.start(Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
-    np.testing.assert_array_equal(provider.jacobian(state), [[0.2, 0.6]])
-
-
 def test_a_nominal_model_of_another_robot_is_refused():
     provider = initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6))))
     with pytest.raises(ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"):
         provider.start(Observation(0.0, np.zeros(2), np.zeros(1)))
 
 
-def test_a_given_jacobian_is_taken_as_it_is():
-    provider = initial_jacobian(InitialConfig("given", given=((1.0, 2.0),)), RobotKnowledge(spec(), 0))
+@pytest.mark.parametrize(
+    ("config", "jacobian"),
+    [(InitialConfig(), [[0.2, 0.6]]), (InitialConfig("given", given=((1.0, 2.0),)), [[1.0, 2.0]])],
+)
+def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_taken_as_it_is(config, jacobian):
+    provider = initial_jacobian(config, RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :]))
     assert provider.immediate
-    state = provider.start(Observation(0.0, np.zeros(2), np.zeros(1)))
-    np.testing.assert_array_equal(provider.jacobian(state), [[1.0, 2.0]])
+    state = provider.start(Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
+    np.testing.assert_array_equal(provider.jacobian(state), jacobian)
 
 
-def test_the_nominal_source_without_a_model_tells_the_remedy():
-    with pytest.raises(ValueError, match=r"source 'nominal' needs a nominal model.*take 'probe' or 'given'"):
-        initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0))
-
-
-@pytest.mark.parametrize("given", [(), ((1.0,),), ((1.0, 2.0), (3.0,))])
-def test_a_given_jacobian_of_the_wrong_shape_is_refused(given):
-    with pytest.raises(ValueError, match="given must hold 1 rows of 2 entries"):
-        initial_jacobian(InitialConfig("given", given=given), RobotKnowledge(spec(), 0))
-
-
-def test_a_probing_move_faster_than_a_joint_or_larger_than_its_range_is_refused():
-    with pytest.raises(ValueError, match=r"probe_step must be at most 0\.1 rad"):
-        initial_jacobian(InitialConfig("probe", probe_step=0.2), RobotKnowledge(spec(), 0))
-    with pytest.raises(ValueError, match="probe_step must be at most half the joint range"):
-        initial_jacobian(InitialConfig("probe"), RobotKnowledge(spec(reach=0.02), 0))
+@pytest.mark.parametrize(
+    ("settings", "reach", "message"),
+    [
+        ({}, 1.0, r"source 'nominal' needs a nominal model.*take 'probe' or 'given'"),
+        *(
+            ({"source": "given", "given": given}, 1.0, "given must hold 1 rows of 2 entries")
+            for given in ((), ((1.0,),), ((1.0, 2.0), (3.0,)))
+        ),
+        ({"source": "probe", "probe_step": 0.2}, 1.0, r"probe_step must be at most 0\.1 rad"),
+        ({"source": "probe"}, 0.02, "probe_step must be at most half the joint range"),
+    ],
+)
+def test_a_source_that_does_not_fit_the_robot_is_refused(settings, reach, message):
+    with pytest.raises(ValueError, match=message):
+        initial_jacobian(InitialConfig(**settings), RobotKnowledge(spec(reach), 0))

@@ -1,5 +1,7 @@
 """Tests of the two radial-basis networks against their formulas, plain loops and their own sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,12 +11,8 @@ from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwo
 
 def controller_network(n=3, m=2, hidden=5, error_history=2, position_history=1, kernel="exponential", seed=0):
     rng, p = np.random.default_rng(seed), m * error_history + n * position_history
-    centres, widths, weights = (
-        rng.normal(size=(hidden, p)),
-        rng.uniform(1.0, 2.0, hidden),
-        rng.normal(size=(n, p, hidden)),
-    )
-    return ControllerNetwork(centres, widths, weights, error_history, position_history, kernel)
+    arrays = rng.normal(size=(hidden, p)), rng.uniform(1.0, 2.0, hidden), rng.normal(size=(n, p, hidden))
+    return ControllerNetwork(*arrays, error_history, position_history, kernel)
 
 
 def test_the_jacobian_equals_a_plain_loop_over_columns_and_units():
@@ -87,34 +85,26 @@ def test_networks_are_read_only():
         jacobian_network().weights[0, 0, 0] = 1.0
 
 
-def test_arrays_that_do_not_fit_together_are_refused():
-    good = jacobian_network()
-    with pytest.raises(ValueError, match=r"centres must have shape \(3, 4, 3\), got \(3, 4, 2\)"):
-        JacobianNetwork(good.centres[:, :, :2], good.widths, good.weights)
-    with pytest.raises(ValueError, match=r"weights must have shape \(3, 2, 4\)"):
-        JacobianNetwork(good.centres, good.widths, good.weights[:, :, :3])
-    with pytest.raises(ValueError, match=r"widths must have shape \(3, 4\)"):
-        JacobianNetwork(good.centres, good.widths[:, :3], good.weights)
-    with pytest.raises(ValueError, match="widths must be positive"):
-        JacobianNetwork(good.centres, 0.0 * good.widths, good.weights)
-    with pytest.raises(ValueError, match="weights of a network must be finite"):
-        JacobianNetwork(good.centres, good.widths, good.weights * np.nan)
-    with pytest.raises(ValueError, match="centres and weights must be"):
-        JacobianNetwork(good.centres[0], good.widths, good.weights)
+GOOD, CONTROLLER = jacobian_network(), controller_network()
 
 
-def test_controller_networks_that_do_not_fit_their_histories_are_refused():
-    good = controller_network()
-    parts = good.centres, good.widths, good.weights
-    with pytest.raises(ValueError, match=r"weights must have m L_e \+ n L_c columns"):
-        ControllerNetwork(*parts, 3, 1)
-    with pytest.raises(ValueError, match="weights must have m L_e"):
-        ControllerNetwork(*parts, 0, 1)
-    with pytest.raises(ValueError, match="kernel must be one of exponential, gaussian, got 'cubic'"):
-        ControllerNetwork(*parts, 2, 1, "cubic")
-    with pytest.raises(ValueError, match=r"centres must have shape \(5, 7\)"):
-        ControllerNetwork(good.centres[:, :5], good.widths, good.weights, 2, 1)
-    with pytest.raises(ValueError, match=r"weights must be \(n, p, N_h\)"):
-        ControllerNetwork(good.centres, good.widths, good.weights[0], 2, 1)
-    with pytest.raises(ValueError, match="widths must be positive"):
-        ControllerNetwork(good.centres, -good.widths, good.weights, 2, 1)
+@pytest.mark.parametrize(
+    ("good", "changes", "message"),
+    [
+        (GOOD, {"centres": GOOD.centres[:, :, :2]}, r"centres must have shape \(3, 4, 3\), got \(3, 4, 2\)"),
+        (GOOD, {"weights": GOOD.weights[:, :, :3]}, r"weights must have shape \(3, 2, 4\)"),
+        (GOOD, {"widths": GOOD.widths[:, :3]}, r"widths must have shape \(3, 4\)"),
+        (GOOD, {"widths": 0.0 * GOOD.widths}, "widths must be positive"),
+        (GOOD, {"weights": GOOD.weights * np.nan}, "weights of a network must be finite"),
+        (GOOD, {"centres": GOOD.centres[0]}, "centres and weights must be"),
+        (CONTROLLER, {"error_history": 3}, r"weights must have m L_e \+ n L_c columns"),
+        (CONTROLLER, {"error_history": 0}, "weights must have m L_e"),
+        (CONTROLLER, {"kernel": "cubic"}, "kernel must be one of exponential, gaussian, got 'cubic'"),
+        (CONTROLLER, {"centres": CONTROLLER.centres[:, :5]}, r"centres must have shape \(5, 7\)"),
+        (CONTROLLER, {"weights": CONTROLLER.weights[0]}, r"weights must be \(n, p, N_h\)"),
+        (CONTROLLER, {"widths": -CONTROLLER.widths}, "widths must be positive"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_or_the_histories_are_refused(good, changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(good, **changes)

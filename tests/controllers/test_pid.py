@@ -32,21 +32,12 @@ def test_the_first_step_equals_the_one_computed_by_hand():
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 
-def test_the_derivative_is_the_filtered_difference_of_the_error():
+def test_the_derivative_is_the_filtered_difference_of_the_error_and_the_first_error_has_none():
     law = fresh(proportional_gain=1.0, derivative_gain=1.0, derivative_filter=0.15)
-    law.command(Estimate(J), look([0.0, 0.0]), np.zeros((2, 2)))
-    u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
-    # d = (0.15 · 0 + 0.1) / (0.15 + 0.05) = 0.5
-    np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05 + 0.5, 0.0], atol=1e-14)
-    u = law.command(Estimate(J), look([-0.3, 0.0]), np.zeros((2, 2)))
-    # d = (0.15 · 0.5 + 0.3 − 0.1) / (0.15 + 0.05) = 1.375
-    np.testing.assert_allclose(J @ u, [0.3 * (1.0 - np.exp(-0.05)) / 0.05 + 1.375, 0.0], atol=1e-14)
-
-
-def test_the_first_error_has_no_derivative():
-    law = fresh(proportional_gain=1.0, derivative_gain=1.0)
-    u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
-    np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05, 0.0], atol=1e-14)
+    # d = 0, then (0.15 · 0 + 0.3 − 0.1) / (0.15 + 0.05) = 1, then (0.15 · 1 + 0.4 − 0.3) / (0.15 + 0.05) = 1.25
+    for error, d in ((0.1, 0.0), (0.3, 1.0), (0.4, 1.25)):
+        u = law.command(Estimate(J), look([-error, 0.0]), np.zeros((2, 2)))
+        np.testing.assert_allclose(J @ u, [error * (1.0 - np.exp(-0.05)) / 0.05 + d, 0.0], atol=1e-14)
 
 
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():

@@ -257,15 +257,6 @@ def knowledge(**changes):
     return dataclasses.replace(RobotKnowledge(SPEC, 10, planar_jacobian, region=region), **changes)
 
 
-def test_an_empty_region_means_the_one_in_which_the_robot_works(networks):
-    empty = dataclasses.replace(CONFIG, lower=(), upper=())
-    assert obtain_networks(empty, knowledge()).digest == networks.digest
-    with pytest.raises(ValueError, match="training needs a region"):
-        obtain_networks(empty, knowledge(region=None))
-    with pytest.raises(ValueError, match="training needs a nominal model"):
-        obtain_networks(CONFIG, knowledge(nominal_jacobian=None))
-
-
 def test_all_presets_take_their_networks_from_the_harness(networks):
     asked = []
 
@@ -306,25 +297,29 @@ def test_a_jacobian_that_the_network_can_represent_is_fitted_to_the_last_digits(
     np.testing.assert_allclose(fitted.jacobian.jacobian(q), true.jacobian(q), atol=1e-5)
 
 
-def test_rules_across_settings_name_both():
-    for config, values, message in (
-        (MpcConfig, {"view_tangent": (0.5,)}, r"empty or \(horizontal, vertical\), got \(0.5,\)"),
-        (ControllerTraining, {"samples": 59}, "samples must be at least the 60 hidden units, got 59"),
-        (JacobianTraining, {"centres": 60, "samples": 59}, "samples must be at least the 60 centres, got 59"),
-        (TrainingConfig, {"lower": (0.0,), "upper": (1.0, 1.0)}, "lower and upper must be equally long, got 1 and 2"),
-        (TrainingConfig, {"lower": (1.0,), "upper": (1.0,)}, "lower must be below upper"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            config(**values)
+EMPTY = dataclasses.replace(CONFIG, lower=(), upper=())
+REFUSED = [
+    (lambda: MpcConfig(view_tangent=(0.5,)), r"empty or \(horizontal, vertical\), got \(0.5,\)"),
+    (lambda: ControllerTraining(samples=59), "samples must be at least the 60 hidden units, got 59"),
+    (lambda: JacobianTraining(centres=60, samples=59), "samples must be at least the 60 centres, got 59"),
+    (lambda: TrainingConfig((0.0,), (1.0, 1.0)), "lower and upper must be equally long, got 1 and 2"),
+    (lambda: TrainingConfig((1.0,), (1.0,)), "lower must be below upper"),
+    (
+        lambda: train(TrainingConfig((0.0,) * 2, (1.0,) * 2), planar_jacobian, SPEC),
+        "lower and upper must name 3 joints, got 2",
+    ),
+    (lambda: train(CONFIG, lambda q: planar_jacobian(q)[..., :2], SPEC), "nominal_jacobian must return"),
+    (lambda: train(CONFIG, lambda q: planar_jacobian(q) * np.nan, SPEC), "nominal_jacobian must be finite"),
+    (lambda: obtain_networks(EMPTY, knowledge(region=None)), "training needs a region"),
+    (lambda: obtain_networks(CONFIG, knowledge(nominal_jacobian=None)), "training needs a nominal model"),
+]
 
 
-def test_a_region_of_another_robot_is_refused():
-    with pytest.raises(ValueError, match="lower and upper must name 3 joints, got 2"):
-        train(TrainingConfig((0.0, 0.0), (1.0, 1.0)), planar_jacobian, SPEC)
+@pytest.mark.parametrize(("build", "message"), REFUSED)
+def test_settings_that_do_not_go_together_or_with_the_robot_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
 
 
-def test_a_nominal_jacobian_of_the_wrong_shape_or_not_finite_is_refused():
-    with pytest.raises(ValueError, match="nominal_jacobian must return"):
-        train(CONFIG, lambda q: planar_jacobian(q)[..., :2], SPEC)
-    with pytest.raises(ValueError, match="nominal_jacobian must be finite"):
-        train(CONFIG, lambda q: planar_jacobian(q) * np.nan, SPEC)
+def test_an_empty_region_means_the_one_in_which_the_robot_works(networks):
+    assert obtain_networks(EMPTY, knowledge()).digest == networks.digest
