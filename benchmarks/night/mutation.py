@@ -43,14 +43,14 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     ),
     "estimators": (
         ("controllers/estimators/*.py",),
-        ("controllers/test_estimators.py", "controllers/test_rbf.py", "controllers/test_estimator_lanes.py",
-         "controllers/test_correntropy.py", "controllers/test_robust_filter.py"),
+        ("controllers/test_estimators.py", "controllers/test_rbf.py", "controllers/test_correntropy.py",
+         "controllers/test_robust_filter.py"),
     ),
     "laws": (
         ("controllers/laws/*.py", "controllers/laws/mpc/*.py", "controllers/periods.py"),
-        ("controllers/test_pid.py", "controllers/test_mfac.py", "controllers/test_laws.py",
+        ("controllers/test_pid.py", "controllers/test_mfac.py", "controllers/test_servo.py",
          "controllers/test_periods.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
-         "controllers/test_mpc_closed_form.py", "controllers/test_mpc_optimality.py"),
+         "controllers/test_mpc_optimality.py"),
     ),
     "metrics": (
         ("harness/run/metrics.py",),

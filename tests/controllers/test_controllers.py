@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kit.toy import plant_spec, seen
+from kit.toy import KNOWLEDGE, networks, plant_spec, seen
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial_jacobian import InitialConfig
@@ -157,3 +157,21 @@ def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
     parts = [field.name for field in dataclasses.fields(compose("pid", "rls").config())]
     assert parts == ["estimator", "law", "initial", "aids"]
     assert hasattr(compose("pid", "rbf").config(), "training")
+
+
+def test_only_the_law_that_was_trained_on_the_nominal_model_works_in_its_frame():
+    assert {name for name, part in LAWS.items() if part.make.in_model_frame} == {"rbfnn"}
+
+
+def test_laws_declare_the_stages_that_they_bring():
+    for name, config, owned in (
+        ("pid", {}, set()),
+        ("mfac", {}, set()),
+        ("mpc", {}, {"limit", "preview"}),
+        ("mpc", {"use_preview": False, "delay": 0.1}, {"limit", "predict"}),
+        ("rbfnn", {}, {"preview"}),
+        ("rbfnn", {"preview": False}, set()),
+    ):
+        part = LAWS[name]
+        made = part.make(part.config(**config), KNOWLEDGE, *([networks()] if part.trained else []))
+        assert made.owns == owned

@@ -3,11 +3,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from kit.toy import PERIOD, Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate
-from servobench.controllers.laws.mpc.closed_form import Blocks, UnlimitedPlan, bridging_shares, move_weights
+from servobench.controllers.laws.mpc.closed_form import (
+    Blocks,
+    bridging_shares,
+    horizon_integrals,
+    move_weights,
+    preview_weights,
+)
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, exceeds, view_rows
 from servobench.plant.contract.faults import SolverFailed
@@ -85,19 +92,6 @@ def test_a_joint_of_twice_the_weight_moves_less():
     law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0, joint_weight=(1.0, 2.0))
     velocity = law.command(Estimate(np.array([[2.0, 2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity * PERIOD, [0.2 / 7.0, 0.1 / 7.0], rtol=1e-9)
-
-
-@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
-@pytest.mark.parametrize("seed", range(3))
-def test_program_without_active_limits_is_the_closed_form(solver, seed):
-    qp, shape = program(solver=solver, view=True, seed=seed)
-    J, targets = random_jacobian(seed, 2, 4), np.random.default_rng(seed).normal(size=(5, 2))
-    expected, _ = UnlimitedPlan.of_free_moves(shape.weights, shape.move_weight).minimise(J, targets)
-    np.testing.assert_allclose(qp.solve(J, targets, make_bounds(shape)).moves, expected, atol=1e-8)
-
-    qp, shape = program(constant=True, solver=solver, seed=seed)
-    expected, _ = UnlimitedPlan.of_constant_step(40.0, 5, shape.move_weight).minimise(J, targets[:1])
-    np.testing.assert_allclose(qp.solve(J, targets[:1], make_bounds(shape)).moves, expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("constant", [False, True])
@@ -203,19 +197,6 @@ def test_a_moving_reference_is_met_with_the_feedforward_of_its_preview():
         np.testing.assert_allclose(law.command(Estimate(J), observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6)
     held = make_law(spec, preview=0, use_preview=False)
     np.testing.assert_allclose(held.command(Estimate(J), observe(spec), ramp[:1]), 0.0, atol=1e-12)
-
-
-def test_commands_already_sent_bridge_the_delay():
-    # A pure delay of two periods, exact J: with the bridge the error decays as β^τ from the first command on.
-    spec = make_spec(2, 2, speed=10.0)
-    law = make_law(spec, delay=2 * PERIOD, **blocks(1), decay=0.5 / PERIOD, move_weight=1e-9)
-    q, queue, errors = np.zeros(2), [np.zeros(2)] * 2, []
-    for _ in range(8):
-        errors.append(np.array([0.3, -0.2]) - q)
-        queue.append(law.command(Estimate(np.eye(2)), observe(spec, q, q), hold([0.3, -0.2])) * PERIOD)
-        q = q + queue.pop(0)
-    for k in range(2, 7):
-        np.testing.assert_allclose(errors[k + 1], np.exp(-0.5) * errors[k], rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["moves", "constant"])
@@ -373,3 +354,45 @@ def test_the_optimum_in_continuous_time_does_not_depend_on_the_length_of_the_blo
         for count in (10, moves)
     ]
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9 if mode == "constant" else 0.15)
+
+
+ALPHAS = (1.0, 1.0 - 1e-15, 1.0 - 1e-12, 1.0 - 1e-9, 1.0 - 1e-6, 0.999, 0.96, 0.95, 0.9, 0.5, 0.05)
+
+
+def integral(function, horizon):
+    return quad(function, 0.0, horizon, epsabs=0.0, epsrel=1e-13, limit=200)[0]
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("horizon", [1, 2, 10, 40])
+def test_a_b_and_c_equal_quadrature(alpha, horizon):
+    found = horizon_integrals(horizon, alpha, 0.1)
+    assert found.a == pytest.approx(integral(lambda t: t**2 * alpha**t, horizon), rel=1e-10)
+    assert found.b == pytest.approx(integral(lambda t: t * alpha**t, horizon), rel=1e-10)
+    for rho in (1e-9, 1e-4, 0.01, 0.2, 5.0):
+        found = horizon_integrals(horizon, alpha, rho)
+        beta = np.exp(-rho)
+        assert found.c == pytest.approx(integral(lambda t, beta=beta: t * (alpha * beta) ** t, horizon), rel=1e-10)
+
+
+def test_extreme_forgetting_stays_finite():
+    found = horizon_integrals(40, 1e-300, 700.0)
+    assert 0.0 < found.c < found.b < 1e-4
+    assert not move_weights(40, 1e-300, 0.0).any()
+    assert np.isfinite(preview_weights(40, 1e-300)).all()
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.95, 0.3])
+def test_preview_weights_integrate_a_broken_line_exactly(alpha):
+    horizon = 6
+    r = np.random.default_rng(0).normal(size=horizon + 1)
+    r[0] = 0.0
+    nodes = np.arange(horizon + 1)
+    pieces = [
+        quad(lambda t: t * alpha**t * np.interp(t, nodes, r), start, start + 1, epsabs=1e-14)[0] for start in nodes[:-1]
+    ]
+    assert preview_weights(horizon, alpha) @ r[1:] == pytest.approx(sum(pieces), abs=1e-12)
+    # A unit ramp turns ∫ τ α^τ τ dτ into a.
+    assert preview_weights(horizon, alpha) @ nodes[1:] == pytest.approx(
+        horizon_integrals(horizon, alpha, 0.1).a, rel=1e-12
+    )
