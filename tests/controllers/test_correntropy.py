@@ -16,7 +16,6 @@ from servobench.controllers.estimators.correntropy import (
     mckf_estimator,
     rmckf_estimator,
 )
-from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
 
 M, N, WALK, NOISE = 3, 4, 0.09, 0.001
 FILTERS = {
@@ -115,17 +114,6 @@ def test_every_update_equals_the_published_formulas(name):
         np.testing.assert_allclose(block_diag(*run.state.P), P, rtol=1e-12, atol=1e-12)
     deviation = np.sqrt(np.trace(P) / (M * N))
     assert run.diagnostics() == {"estimator_updated": True, "jacobian_deviation": pytest.approx(deviation)}
-
-
-@pytest.mark.parametrize("name", ["mckf", "imcckf", "rmckf"])
-def test_without_a_bound_of_the_bandwidth_they_are_the_kalman_filter(name):
-    kind, make = FILTERS[name]
-    J = np.zeros((M, N))
-    plain, filtered = Learning(kalman_estimator(KalmanConfig()), J), Learning(make(kind(bandwidth=1e9)), J)
-    for dq, dy in motions(30):
-        plain.update(motion(dq, dy))
-        filtered.update(motion(dq, dy))
-    np.testing.assert_allclose(filtered.jacobian(), plain.jacobian(), atol=1e-5 if name == "rmckf" else 1e-12)
 
 
 @pytest.mark.parametrize("name", FILTERS)

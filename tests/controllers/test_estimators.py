@@ -1,13 +1,16 @@
-"""Tests of the estimators of one matrix: against each other, against batch facts, and steps by hand."""
+"""Tests of the estimators: against each other, against batch facts, steps by hand, and all of them over lanes."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kit.toy import Learning, motion, plant_spec
+from kit.toy import KNOWLEDGE, PERIOD, Learning, M, N, jacobian_network, motion, only_jacobian, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     RandomWalkEstimator,
@@ -28,14 +31,8 @@ from servobench.controllers.estimators.projection import (
     ProjectionEstimator,
     projection_update,
 )
-
-LEARNING = [
-    ProjectionEstimator(BroydenConfig(step_factor=1.0)),
-    RlsEstimator(RlsConfig()),
-    ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
-    kalman_estimator(KalmanConfig()),
-    ukf_estimator(UkfConfig(form="sigma_points")),
-]
+from servobench.controllers.methods import ESTIMATORS
+from servobench.plant.contract.faults import FilterDiverged
 
 
 def covariance_of(state):
@@ -51,34 +48,6 @@ def random_motions(n, m, count, seed=3):
         J = J + rng.normal(scale=0.01, size=(m, n))
         dq = rng.normal(scale=0.03, size=n)
         yield dq, J @ dq + rng.normal(scale=0.0014, size=m)
-
-
-@pytest.mark.parametrize("estimator", LEARNING)
-def test_a_constant_jacobian_is_found_when_all_joints_move(estimator):
-    rng = np.random.default_rng(0)
-    J = rng.normal(size=(3, 6))
-    run = Learning(estimator, np.zeros((3, 6)))
-    for _ in range(400):
-        dq = rng.normal(scale=0.05, size=6)
-        run.update(motion(dq, J @ dq))
-    np.testing.assert_allclose(run.jacobian(), J, atol=0.01 if isinstance(estimator, RandomWalkEstimator) else 1e-3)
-
-
-@pytest.mark.parametrize("estimator", LEARNING)
-def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
-    run = Learning(estimator, np.ones((3, 6)))
-    before = run.diagnostics()
-    run.update(motion(np.full(6, 1e-4), np.full(3, 0.002)))
-    np.testing.assert_array_equal(run.jacobian(), np.ones((3, 6)))
-    assert run.diagnostics() == before
-    assert before["estimator_updated"] == 0.0
-
-
-@pytest.mark.parametrize("estimator", LEARNING[:2])
-def test_a_motion_that_is_just_large_enough_is_used(estimator):
-    run = Learning(estimator, np.ones((1, 2)))
-    run.update(motion([0.01, 0.0], [0.5]))
-    assert run.diagnostics()["estimator_updated"] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -219,25 +188,6 @@ def test_forgetting_does_not_wind_up_while_one_joint_rests():
     np.testing.assert_allclose(run.jacobian(), [[0.3, 0.0, 0.0]], atol=1e-3)
 
 
-@pytest.mark.parametrize(("size", "resets"), [(0.011, 0.0), (0.009, 1.0)])
-def test_the_compact_form_returns_to_its_start_when_it_vanishes(size, resets):
-    run = Learning(
-        ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset_norm=0.01)), np.array([[0.5]])
-    )
-    run.update(motion([0.1], [0.1 * size]))
-    assert run.diagnostics()["jacobian_resets"] == resets
-    np.testing.assert_allclose(run.jacobian(), [[0.5 if resets else size]], atol=1e-9)
-
-
-def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():
-    for reset, expected in ((True, 0.5), (False, -0.5)):
-        estimator = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
-        run = Learning(estimator, np.array([[0.5]]))
-        run.update(motion([0.1], [-0.05]))
-        np.testing.assert_allclose(run.jacobian(), [[expected]], atol=1e-9)
-        assert run.diagnostics()["jacobian_resets"] == float(reset)
-
-
 def test_the_constant_estimator_keeps_the_first_jacobian():
     J = np.arange(6.0).reshape(2, 3)
     run = Learning(ConstantEstimator(), J)
@@ -259,3 +209,73 @@ def test_an_estimator_that_lacks_what_it_needs_is_refused():
         TrueEstimator(TrueConfig(), knowledge)
     with pytest.raises(ValueError, match="covariance_limit must be at least initial_covariance"):
         RlsConfig(initial_covariance=2.0, covariance_limit=1.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "size", "expected"),
+    [
+        ({"reset_norm": 0.01}, 0.011, 0.011),
+        ({"reset_norm": 0.01}, 0.009, 0.5),
+        ({}, -0.5, 0.5),
+        ({"reset": False}, -0.5, -0.5),
+    ],
+)
+def test_the_compact_form_returns_to_its_start_when_it_vanishes_or_its_sign_is_lost(settings, size, expected):
+    estimator = ProjectionEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, **settings))
+    run = Learning(estimator, np.array([[0.5]]))
+    run.update(motion([0.1], [0.1 * size]))
+    assert run.diagnostics()["jacobian_resets"] == float(expected == 0.5)
+    np.testing.assert_allclose(run.jacobian(), [[expected]], atol=1e-9)
+
+
+NETWORK = jacobian_network(N, M, units=5)
+KNOWING = dataclasses.replace(KNOWLEDGE, true_jacobian=NETWORK.jacobian)
+SETTINGS = [
+    *((name, {}) for name in ESTIMATORS),
+    ("kalman", {"form": "full"}),
+    ("ukf", {"form": "sigma_points"}),
+    ("rbf", {"window": 1}),
+]
+
+
+def made(name, changes):
+    part = ESTIMATORS[name]
+    return part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+
+
+@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
+def test_at_the_start_each_lane_tells_its_own_numbers(name, changes):
+    estimator = made(name, changes)
+    for lead in ((), (3,), (2, 3)):
+        J = np.ones((*lead, M, N))
+        state = estimator.start(J)
+        assert {np.shape(value) for value in estimator.diagnostics(state).values()} <= {lead}
+        assert estimator.jacobian(state, np.zeros((*lead, N))).shape == J.shape
+
+
+@pytest.mark.parametrize("name", ["kalman", "ukf", "mckf", "rls", "cfdl", "broyden"])
+def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
+    estimator = made(name, {"min_joint_step": 0.25})
+    for length, counts in ((0.25, True), (0.2499, False)):
+        state = estimator.start(np.ones((M, N)))
+        way = Motion(np.zeros(N), length * np.eye(N)[1], np.full(M, 0.1), np.zeros(M), np.asarray(PERIOD)[()])
+        after = estimator.update(state, way)
+        assert bool(estimator.diagnostics(after)["estimator_updated"]) == counts
+        assert counts != (after.J == state.J).all()
+
+
+FILTERS = [each for each in SETTINGS if hasattr(made(*each).start(np.ones((M, N))), "P")]
+
+
+@pytest.mark.parametrize(("name", "changes"), FILTERS, ids=lambda part: part if isinstance(part, str) else "")
+@pytest.mark.parametrize("factor", [-1.0, np.nan])
+def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(name, changes, factor):
+    estimator = made(name, changes)
+    state = estimator.start(np.ones((M, N)))
+    way = Motion(np.zeros(N), np.full(N, 0.3), np.zeros(M), np.zeros(M), np.asarray(PERIOD)[()])
+    with pytest.raises(FilterDiverged, match="covariance is not"), np.errstate(invalid="ignore"):
+        estimator.update(state._replace(P=factor * state.P), way)
+
+
+def test_estimators_say_which_of_them_bring_a_model():
+    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov"}
