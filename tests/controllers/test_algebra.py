@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from servobench.controllers.algebra import damped_inverse, nearest_rotation, project_to_row_space
-from servobench.controllers.stages.finish import step_with_posture
 
 
 @settings(max_examples=40)
@@ -35,16 +34,6 @@ def test_the_nearest_rotation_is_proper_and_no_other_is_nearer(m):
 def damped_inverse_by_svd(J, damping):
     U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
     return (Vt.T * (sigma / (sigma**2 + damping**2))) @ U.T
-
-
-def test_the_projection_keeps_what_moves_the_feature_and_nothing_else():
-    rng = np.random.default_rng(5)
-    J, W = rng.normal(size=(2, 4)), rng.normal(size=(4, 3, 5))
-    projected = project_to_row_space(W, J)
-    np.testing.assert_allclose(np.einsum("mn,npl->mpl", J, projected), np.einsum("mn,npl->mpl", J, W), atol=1e-12)
-    null = np.eye(4) - np.linalg.pinv(J) @ J
-    np.testing.assert_allclose(np.einsum("ij,jpl->ipl", null, projected), 0.0, atol=1e-12)
-    np.testing.assert_allclose(project_to_row_space(projected, J), projected, atol=1e-12)
 
 
 @pytest.mark.parametrize("smallest", [1.0, 1e-2, 1e-6, 1e-12, 0.0])
@@ -75,13 +64,3 @@ def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():
     for lane, single in enumerate((ordinary, huge, ordinary)):
         np.testing.assert_array_equal(both[lane], damped_inverse(single, 0.02))
     np.testing.assert_allclose(both[1], damped_inverse_by_svd(huge, 0.02), rtol=1e-6)
-
-
-def test_a_posture_moves_the_joints_towards_it_and_the_feature_not_at_all():
-    rng = np.random.default_rng(1)
-    J, v, away = rng.normal(size=(2, 5)), rng.normal(size=2), rng.normal(size=5)
-    inverse = np.linalg.pinv(J)
-    step = step_with_posture(inverse, J, v, away, 0.3)
-    np.testing.assert_allclose(J @ step, v, atol=1e-12)
-    np.testing.assert_allclose(step - inverse @ v, 0.3 * (np.eye(5) - inverse @ J) @ away, atol=1e-12)
-    np.testing.assert_array_equal(step_with_posture(inverse, J, v, away, 0.0), inverse @ v)

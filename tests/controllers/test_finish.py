@@ -82,14 +82,6 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
     np.testing.assert_allclose(held[:2], [1.0, 0.0], atol=1e-4)
 
 
-def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
-    """Both move the feature by 1 m/rad; (0.3, 0.1) wants 0.4 m, scaled to (0.1, 0.033); the second goes on to 0.1."""
-    J, limit, small = np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), np.array([0.05, 0.1])
-    dq = redistribute(np.array([0.3, 0.1]), J, limit, 1e-9, (limit, limit))
-    np.testing.assert_allclose(dq, [0.1, 0.1])
-    np.testing.assert_array_equal(redistribute(small, J, limit, 1e-9, (limit, limit)), small)
-
-
 @settings(max_examples=60)
 @given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):

@@ -85,27 +85,6 @@ def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
     assert first * 0.9 > V
 
 
-def test_beyond_a_step_size_of_two_the_weights_do_move_away():
-    true, rng = network(seed=5), np.random.default_rng(6)
-    rows = true.rows + rng.normal(size=true.rows.shape)
-    q, dq = rng.normal(size=(1, 3)), rng.normal(size=(1, 3))
-    theta = jacobian_features(q, true.centres, true.widths)
-    errors = np.matvec(true.jacobian(q) - true.jacobian(q, rows), dq)
-    after = rows + step_of(theta, dq, 2.1, 0.0) * true.gradient(errors, dq, true.features(q))
-    assert np.sum((after - true.rows) ** 2) > np.sum((rows - true.rows) ** 2)
-
-
-def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
-    moved = []
-    for epsilon in (0.0, 1e-3):
-        estimator = started(RbfConfig(epsilon=epsilon), network())
-        rng = np.random.default_rng(8)
-        for _ in range(30):
-            estimator.update(motion(1e-5 * rng.normal(size=3), 1e-3 * rng.normal(size=2)))
-        moved.append(np.linalg.norm(estimator.state.rows - network().rows))
-    assert moved[1] < 1e-3 * moved[0]
-
-
 def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
     estimator = started(RbfConfig(epsilon=0.0), network())
     estimator.update(motion(np.zeros(3), [1e-3, 0.0]))
@@ -166,7 +145,7 @@ def test_the_first_lyapunov_update_equals_the_one_computed_by_hand():
     assert estimator.diagnostics()["rate_error"] == pytest.approx(6.0)
 
 
-def lyapunov_run(gain=4.0, dt=1e-3, steps=1500, sign=1.0):
+def lyapunov_run(gain=4.0, dt=1e-3, steps=1500):
     """Return V and its predicted rate along u = K_p Ĵ⁺ e on the plant ẏ = J(q) q̇ whose J the network can represent."""
     true, config, rng = network(seed=3), RbfLyapunovConfig(n2=0.5, n3=0.5), np.random.default_rng(4)
     weights = true.weights + 0.2 * rng.normal(size=true.weights.shape)
@@ -178,7 +157,7 @@ def lyapunov_run(gain=4.0, dt=1e-3, steps=1500, sign=1.0):
         s = J @ u - J_hat @ u
         V.append(0.5 * config.n2 * e @ e + 0.5 * np.sum((true.rows - estimator.state.rows) ** 2))
         rate.append(-gain * config.n2 * e @ e - config.n3 * s @ s)
-        estimator.update(motion(u * dt, J @ u * dt, sign * e, q, dt))
+        estimator.update(motion(u * dt, J @ u * dt, e, q, dt))
         q, e = q + u * dt, e - J @ u * dt
     return np.array(V), np.array(rate), e
 
@@ -188,15 +167,3 @@ def test_v_decreases_along_a_run_and_at_the_predicted_rate():
     assert (np.diff(V) < 0.0).all()
     np.testing.assert_allclose(np.diff(V)[:50] / 1e-3, rate[:50], rtol=0.01)
     assert np.linalg.norm(e) < 0.05 * np.linalg.norm([0.3, -0.2])
-
-
-def test_with_the_paper_s_plus_sign_v_would_not_fall_at_that_rate():
-    V, rate, _ = lyapunov_run(steps=50, sign=-1.0)
-    assert np.max(np.abs(np.diff(V) / 1e-3 - rate[:-1]) / np.abs(rate[:-1])) > 0.05
-
-
-def test_a_constant_error_and_an_exact_jacobian_at_the_target_teach_nothing():
-    net, dq = network(), np.array([0.01, -0.02, 0.03])
-    estimator = started_lyapunov(RbfLyapunovConfig(), net)
-    estimator.update(motion(dq, net.jacobian(np.zeros(3)) @ dq))
-    np.testing.assert_allclose(estimator.state.rows, net.rows, atol=1e-15)
