@@ -35,27 +35,6 @@ def test_before_there_is_an_innovation_it_is_the_guess():
         np.testing.assert_array_equal(NoiseLevel.start(GUESS, lead).variance, np.full(lead, GUESS**2))
 
 
-@pytest.mark.parametrize("ratio", [0.25, 0.7, 1.0, 3.0, 16.0, 64.0])
-def test_the_noise_is_found_from_a_quarter_to_64_times_the_guess(ratio):
-    """To the nearest level of the grid, which a long run is sure of."""
-    rng, level, found = np.random.default_rng(6), NoiseLevel.start(GUESS), []
-    for k in range(400):
-        other = 1e-6 * (k % 3)  # variance that is not noise, and known
-        nu = rng.normal(scale=np.sqrt(2.0 * (ratio * GUESS) ** 2 + other), size=3)
-        level = learned(level, [nu], 2.0, other)
-        found.append(level.deviation)
-    assert np.abs(np.log2(np.array(found[100:]) / (ratio * GUESS))).max() < 0.75
-    assert np.abs(np.log2(np.mean(found[100:]) / (ratio * GUESS))) < 0.55
-
-
-def test_many_times_the_noise_is_known_after_three_samples_in_most_lanes():
-    rng, level = np.random.default_rng(7), NoiseLevel.start(GUESS, (200,))
-    for _ in range(3):
-        nu = rng.normal(scale=np.sqrt(2.0) * 16.0 * GUESS, size=(200, 3))
-        level = level.learn(np.vecdot(nu, nu), np.full(200, 3), np.full(200, 2.0), np.zeros(200))
-    assert 0.6 < np.median(level.deviation) / (16.0 * GUESS) < 1.5
-
-
 @pytest.mark.parametrize("size", [0.5, 3.0])
 def test_outliers_count_for_no_level_more_than_for_another(size):
     """Their density does not depend on σ: what the other frames told is flattened by forgetting alone."""

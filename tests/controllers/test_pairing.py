@@ -7,13 +7,13 @@ import pytest
 from scipy.interpolate import BarycentricInterpolator
 from scipy.stats import multivariate_normal
 
-from kit.toy import KNOWLEDGE, NETWORK, PERIOD, SPEC, TURN, M, N, assert_lanes, late_features, seen
+from kit.toy import KNOWLEDGE, NETWORK, PERIOD, SPEC, TURN, M, N, late_features, path, seen
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages import pairing
 from servobench.controllers.stages.estimation import Estimation
-from servobench.plant.contract.signals import Observation, trusted_observation
+from servobench.plant.contract.signals import Observation
 
 MAPPED = {"delay": "identified", "noise": "identified", "model": "regression"}
 
@@ -54,31 +54,13 @@ class Following:
         return np.linalg.norm(self.state.jacobian - true) / np.linalg.norm(true)
 
 
-def path(duration, period=PERIOD, seed=1):
-    """Joint positions, rad, of an arm that speeds up, turns and brakes."""
-    rng, t = np.random.default_rng(seed), period * np.arange(round(duration / period))[:, None]
-    speed = 0.8 * np.sin(2 * np.pi * t / rng.uniform(0.75, 2.0, N) + rng.uniform(0.0, 6.0, N)) * np.minimum(1, t / 0.15)
-    return np.concatenate([np.zeros((1, N)), np.cumsum(period * speed, axis=0)])
-
-
-@pytest.mark.parametrize("delay", range(6))
-@pytest.mark.parametrize("turn", [np.eye(M), TURN], ids=["as modelled", "turned"])
-def test_delay_and_jacobian_are_found_in_noise(delay, turn):
-    q = path(4.0)
-    noise = 2e-4 * np.random.default_rng(0).normal(size=(len(q), M))
-    made = Following().follow(q, late_features(q, turn, delay) + noise)
-    assert made.found["delay"] == pytest.approx(delay * PERIOD)
-    wanted = np.arccos((np.trace(turn) - 1.0) / 2.0)
-    assert made.found["map_rotation"] == pytest.approx(wanted, abs=0.05)
-    assert made.error(turn @ NETWORK.jacobian(q[-1])) < 0.06
-
-
 @pytest.mark.parametrize(("period", "latency"), [(0.1, 0.2), (0.05, 0.15), (0.008, 0.12), (0.004, 0.12), (0.004, 0.0)])
 def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
     q = path(4.0, period)
     noise = 2e-4 * np.random.default_rng(0).normal(size=(len(q), M))
     made = Following(period).follow(q, late_features(q, TURN, round(latency / period)) + noise)
     assert made.found["delay"] == pytest.approx(latency, abs=1.5 * max(period, 0.25 / 24))
+    assert made.found["map_rotation"] == pytest.approx(2.0 * np.pi / 3.0, abs=0.1)
     assert len(made.pair.scores) <= 25
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1  # the delay may lie between two candidates
 
@@ -90,14 +72,6 @@ def test_a_latency_between_two_periods_is_found(period, latency):
     made = Following(period).follow(fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape))
     assert made.found["delay"] == pytest.approx(latency, abs=1.01 * pairing.RESOLUTION)
     assert made.error(TURN @ NETWORK.jacobian(fine[-1])) < 0.1
-
-
-def test_the_delay_is_found_within_a_few_motions():
-    q, found = path(0.6), []
-    for seed in range(20):
-        noise = np.random.default_rng(seed).normal(scale=0.001, size=(len(q), M))
-        found.append(round(Following().follow(q, late_features(q, TURN, 2) + noise).found["delay"] / PERIOD))
-    assert found.count(2) >= 18
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.06, 0.1, 0.25])
@@ -289,30 +263,3 @@ def test_given_noise_is_not_identified():
     assert stage.noise(state) is None
     np.testing.assert_allclose(paired.joint_step, 0.01)
     np.testing.assert_allclose(paired.predicted, 0.05)
-
-
-def test_a_lane_has_the_bits_of_a_single_run():
-    """One lane sees a jump, one loses a feature, one rests for a while; each has a delay of its own."""
-    stage, rng, J = pairing.Pairing(AidsConfig(**MAPPED), KNOWLEDGE, 0.0), np.random.default_rng(3), NETWORK.jacobian
-    q = np.stack([path(2.0, seed=seed)[:40] for seed in range(3)], axis=1)
-    q[20:, 2] = q[20, 2]
-    y = np.stack([late_features(q[:, lane], TURN, lane) for lane in range(3)], axis=1)
-    y += 1e-3 * rng.normal(size=y.shape)
-    y[25:, 0] += 0.5
-    valid = np.full((40, 3, M), True)
-    valid[10:15, 1, 2] = False
-
-    def run(lanes):
-        first = trusted_observation(0.0, q[0, lanes], y[0, lanes], None, valid[0, lanes])
-        state, found = stage.start(first, J(q[0, lanes])), []
-        for k in range(1, 40):
-            state = stage.advance(state, q[k, lanes], J(q[k, lanes]))
-            duration = np.full(np.shape(lanes), PERIOD)[()]
-            state, paired = stage.learn(state, y[k, lanes] - y[k - 1, lanes], duration, valid[k, lanes])
-            found.append(paired)
-            state = stage.interrupt(state) if k == 30 else state
-        return [state, found, stage.diagnostics(state), stage.past(state, q[-1, lanes], 1)]
-
-    *_, found, _ = assert_lanes(run)
-    assert found["delay"] == pytest.approx(PERIOD * np.arange(3), abs=1.01 * pairing.RESOLUTION)
-    assert found["camera_moves"][0] == 1

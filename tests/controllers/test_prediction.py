@@ -46,41 +46,25 @@ def test_at_first_an_arm_is_expected_to_follow_at_once():
     assert made.lead == 0.0
 
 
-def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen():
-    rng, made, rows, answers = np.random.default_rng(0), JointResponse.immediate(3, np.zeros(1), PERIOD), [], []
-    past = np.zeros(3)
-    for _ in range(12):
-        step = float(np.array([0.2, 0.5, 0.3]) @ past) + 0.003 * rng.choice([-1.0, 1.0])
-        if abs(step - made.response @ past) >= 5e-4:
-            rows.append(past)
-            answers.append(step)
-        made = made.learn(np.array([step]))
-        command = 0.05 * rng.normal()
-        past = np.array([command, *past[:-1]])
-        made = made.command(np.array([command]))
-    U, prior = np.array(rows), np.array([1.0, 0.0, 0.0])
-    rho = 2e-4 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
-    expected = np.linalg.solve(U.T @ U + rho, U.T @ np.array(answers) + rho @ prior)
-    assert (expected > 0.0).all()
-    np.testing.assert_allclose(made.response, expected, rtol=1e-9)
-
-
-def test_motions_of_overlapping_windows_are_fitted_together():
-    """Windows of two periods: Δq and dq are sums over two periods, and each row counts half."""
-    rng, prior, q, commands = np.random.default_rng(4), np.array([1.0, 0.0, 0.0]), [0.0, 0.0], [0.0] * 5
-    made, rows, answers = JointResponse.immediate(3, np.zeros(1), PERIOD, window=2), [], []
+@pytest.mark.parametrize("window", [1, 2])
+def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen(window):
+    """Over windows of two periods Δq and dq are sums over two periods, and each row counts half."""
+    rng, prior, q, commands = np.random.default_rng(4), np.array([1.0, 0.0, 0.0]), [0.0] * window, [0.0] * 5
+    made, rows, answers = JointResponse.immediate(3, np.zeros(1), PERIOD, window=window), [], []
     for _ in range(15):
         q.append(q[-1] + float(np.array([0.2, 0.5, 0.3]) @ commands[-1:-4:-1]) + 0.003 * rng.choice([-1.0, 1.0]))
-        row = np.array([commands[-i] + commands[-i - 1] for i in (1, 2, 3)])
-        if abs(q[-1] - q[-3] - made.response @ row) >= 0.01 * 2 * PERIOD:
+        moved = q[-1] - q[-1 - window]
+        row = sum(np.array(commands[-1 - k : -4 - k : -1]) for k in range(window))
+        if abs(moved - made.response @ row) >= 0.01 * window * PERIOD:
             rows.append(row)
-            answers.append(q[-1] - q[-3])
-        made = made.learn(np.array([q[-1] - q[-3]]))
+            answers.append(moved)
+        made = made.learn(np.array([moved]))
         commands.append(0.05 * rng.normal())
         made = made.command(np.array([commands[-1]]))
     U = np.array(rows)
-    rho = 2e-4 * 4 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
-    expected = np.linalg.solve(U.T @ U / 2 + rho, U.T @ np.array(answers) / 2 + rho @ prior)
+    rho = 2e-4 * window**2 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
+    expected = np.linalg.solve(U.T @ U / window + rho, U.T @ np.array(answers) / window + rho @ prior)
+    assert (expected > 0.0).all()
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
 
 

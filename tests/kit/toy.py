@@ -108,6 +108,13 @@ NETWORK = jacobian_network(N, M, units=6)
 NETWORK = dataclasses.replace(NETWORK, weights=0.3 * NETWORK.weights)
 
 
+def path(duration, period=PERIOD, seed=1):
+    """Return joint positions, rad, of an arm that speeds up, turns and brakes, at the begin of each period."""
+    rng, t = np.random.default_rng(seed), period * np.arange(round(duration / period))[:, None]
+    speed = 0.8 * np.sin(2 * np.pi * t / rng.uniform(0.75, 2.0, N) + rng.uniform(0.0, 6.0, N)) * np.minimum(1, t / 0.15)
+    return np.concatenate([np.zeros((1, N)), np.cumsum(period * speed, axis=0)])
+
+
 def late_features(q, turn, delay=0, network=NETWORK):
     """Return features along a path, late by `delay` periods: summed in the very steps in which they are predicted."""
     J = network.jacobian(q)
