@@ -146,11 +146,14 @@ class Plain(servobench.Plant):
 '''
 
 
-def assert_remark(caplog, read, text: str, old: str, new: str, words: str) -> None:
-    """Read a text without a remark, and with other words in it with a remark."""
+def assert_remarks(caplog, read, text: str, cases: list[tuple[str, str, str]]) -> None:
+    """Read a text without a remark, and then with other words in it with one: old words, new words, remark."""
     remark.cache_clear()
     read(text)
     assert not caplog.text
-    assert old in text
-    read(text.replace(old, new))
-    assert words in caplog.text
+    for old, new, words in cases:
+        assert old in text
+        remark.cache_clear()
+        caplog.clear()
+        read(text.replace(old, new))
+        assert words in caplog.text

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from kit.own import assert_remark, write
+from kit.own import assert_remarks, write
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.rendered.settings import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_tree, text
@@ -210,22 +210,19 @@ def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
         robot_of(tmp_path, "arm.toml", FOUR_JOINTS.replace(before, after))
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "message"),
-    [
+def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog):
+    cases = [
         ('convention = "standard"\n', "", 'is read by the standard convention; write convention = "standard" or'),
         ("\nd = [", "\nmass = [3700, 1, 1, 1]\nd = [", "mass is 3700, and usually at most 500 kg; if 3700g is meant"),
         ("\nd = [", "\ntorque = [15e4, 1, 1, 1]\nd = [", "torque is 150000, and usually at most 20000 Nm"),
         ("joint_speed = [2.0", "joint_speed = [0.003", "joint_speed is 0.003, and usually at least 0.01 rad/s"),
-    ],
-)
-def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog, before, after, message):
-    assert_remark(caplog, partial(robot_of, tmp_path, "arm.toml"), FOUR_JOINTS, before, after, message)
+    ]
+    assert_remarks(caplog, partial(robot_of, tmp_path, "arm.toml"), FOUR_JOINTS, cases)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "message"),
-    [
+def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
+    pytest.importorskip("yourdfpy")
+    cases = [
         (' velocity="2"', "", "limits that the URDF lacks are taken as ±2π rad and π rad/s: velocity of joint_1,"),
         (
             'lower="-2.5" ',
@@ -234,31 +231,55 @@ def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog, before, after, me
         ),
         ('rpy="0.1', 'rpy="90', "has an rpy of 90, and angles of a URDF are in rad"),
         ('<mass value="2', '<mass value="2000', "link 'link_1': mass is 2000, and usually at most 500 kg; if 2000g"),
-    ],
-)
-def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog, before, after, message):
-    pytest.importorskip("yourdfpy")
-    assert_remark(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, before, after, message)
+    ]
+    assert_remarks(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, cases)
+
+
+ODD = odd_urdf()
+TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/>' for i in (3, 4)))
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("text", "message"),
     [
-        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>', "joint 'joint_2' turns about the axis 0 0 0; the usual one"),
-        ('<mass value="2', '<mass value="-2', "link 'link_1': mass must be above 0, got -2.0"),
+        (
+            HEAVY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>'),
+            ": joint 'joint_2' turns about the axis 0 0 0; the usual one",
+        ),
+        (HEAVY.replace('<mass value="2', '<mass value="-2'), ": link 'link_1': mass must be above 0, got -2.0"),
+        (TWO_TREES, ".*both foot and link_4 are without a parent: a joint is missing or turned"),
+        (
+            ODD.replace('<link name="link_1"/>', '<link name="dink_1"/>'),
+            ".*joint 'joint_1' is between links of which the file has no 'link_1'",
+        ),
+        *(
+            (text, r" is no URDF, with a <robot> .*line \d+, column \d+")
+            for text in ("<", "<robot name='a'><link", ODD + "<")
+        ),
     ],
 )
-def test_a_urdf_of_no_arm_is_refused(tmp_path, before, after, message):
+def test_a_urdf_of_no_arm_is_refused_in_one_line_in_which_its_reader_says_why(tmp_path, caplog, text, message):
     pytest.importorskip("yourdfpy")
-    with pytest.raises(ValueError, match=rf"robot file .*arm.urdf: {message}"):
-        robot_of(tmp_path, "arm.urdf", HEAVY.replace(before, after))
+    with pytest.raises(ValueError, match=rf"robot file .*arm\.urdf{message}"):
+        robot_of(tmp_path, "arm.urdf", text)
+    assert caplog.records == []
 
 
-def test_an_unknown_robot_is_told_the_nearest():
-    with pytest.raises(ValueError, match="unknown robot 'pandda': did you mean 'panda'"):
-        find_robot("pandda")
-    with pytest.raises(ValueError, match="robot file nowhere.urdf cannot be read"):
-        find_robot("nowhere.urdf")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pandda", "unknown robot 'pandda': did you mean 'panda'"),
+        ("nowhere.urdf", "robot file nowhere.urdf cannot be read"),
+        ("random_arm:1000001", "the number of a random_arm must be from 0 to 1,000,000, got 1000001"),
+        *(
+            (f"random_arm:{number}", "random_arm needs a colon and a number, such as random_arm:7")
+            for number in ("", "-1", "two", "99999999")
+        ),
+    ],
+)
+def test_a_name_of_no_robot_is_refused_with_what_is_wanted(name, message):
+    with pytest.raises(ValueError, match=message):
+        find_robot(name)
 
 
 def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
@@ -290,27 +311,6 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
         find_robot(f"{path}#link_1")
 
 
-@pytest.mark.parametrize("text", ["<", "<robot name='a'><link", odd_urdf() + "<"])
-def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path, caplog, text):
-    pytest.importorskip("yourdfpy")
-    with pytest.raises(ValueError, match=r"arm\.urdf is no URDF, with a <robot> .*line \d+, column \d+"):
-        robot_of(tmp_path, "arm.urdf", text)
-    assert caplog.records == []
-
-
-def test_a_urdf_of_two_trees_is_refused(tmp_path):
-    pytest.importorskip("yourdfpy")
-    before, after = (f'<parent link="link_{i}"/><child link="link_{7 - i}"/>' for i in (3, 4))
-    with pytest.raises(ValueError, match="both foot and link_4 are without a parent: a joint is missing or turned"):
-        robot_of(tmp_path, "arm.urdf", odd_urdf().replace(before, after))
-
-
-def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
-    pytest.importorskip("yourdfpy")
-    with pytest.raises(ValueError, match=r"joint 'joint_1' is between links of which the file has no 'link_1'"):
-        robot_of(tmp_path, "arm.urdf", odd_urdf().replace('<link name="link_1"/>', '<link name="dink_1"/>'))
-
-
 @pytest.mark.slow
 def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
     one, again, other = find_robot("random_arm:1"), random_robot(1), random_robot(0)
@@ -321,17 +321,6 @@ def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
     assert one.n != other.n or not np.allclose(one.arm.translation, other.arm.translation)
     assert set(one.arm.gear_ratio) <= {-1.0, 1.0}
     assert find_robot("random_arm:1") is one
-
-
-@pytest.mark.parametrize("text", ["random_arm:", "random_arm:-1", "random_arm:two", "random_arm:99999999"])
-def test_a_drawn_arm_needs_a_number(text):
-    with pytest.raises(ValueError, match="random_arm needs a colon and a number, such as random_arm:7"):
-        find_robot(text)
-
-
-def test_the_number_of_a_drawn_arm_has_bounds():
-    with pytest.raises(ValueError, match="the number of a random_arm must be from 0 to 1,000,000, got 1000001"):
-        random_robot(1_000_001)
 
 
 def test_a_robot_file_takes_units(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.own import assert_remark, write
+from kit.own import assert_remarks, write
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build, build_together, draw_robot
 from servobench.harness.run.request import RunRequest
@@ -134,16 +134,13 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path, old):
     assert message in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
+def test_parameters_in_other_units_are_remarked_on(tmp_path, caplog):
+    cases = [
         ("zero_elbow = 0.05", "zero_elbow = 2.9", "zero_elbow deviates by 2.9, and usually by 0.5 at most"),
         ("tool_x = 0.013", "tool_x = 13", "tool_x deviates by 13"),
         ("[0.004,", "[4.0,", "latency deviates by 4"),
-    ],
-)
-def test_parameters_in_other_units_are_remarked_on(tmp_path, caplog, old, new, words):
-    assert_remark(caplog, lambda text: find_robot(written(tmp_path, text)), TWIN, old, new, words)
+    ]
+    assert_remarks(caplog, lambda text: find_robot(written(tmp_path, text)), TWIN, cases)
 
 
 def test_a_twin_of_a_twin_is_refused(twin, tmp_path):
