@@ -13,6 +13,7 @@ from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 from servobench.plant.robot.hand_eye import TrueJacobian
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.ur5 import HOME
 
 SEEDS = (11, 4, 7)
@@ -28,6 +29,7 @@ DISTURBED = {
     "outliers": 0.3, "outlier_duration": 0.2, "quantum": 1e-4,
     "occlusions": 0.2, "occlusion_duration": 0.3, "occlusion_windows": ((1.2, 1.4),),
 }  # fmt: skip
+MECHANICS = {"mechanics": MechanicsConfig(backlash=0.035, ripple=0.03, tool_frequency=12.0)}
 
 
 @pytest.fixture(
@@ -35,8 +37,8 @@ DISTURBED = {
         ("kinematic", WORST),
         ("fmu", WORST),
         ("kinematic", FINE | {"overshoot": 0.3}),
-        ("fmu", FINE),
-        ("kinematic", DISTURBED),
+        ("fmu", FINE | MECHANICS),
+        ("kinematic", DISTURBED | MECHANICS),
     ]
 )
 def build(request):
