@@ -9,10 +9,11 @@ import pytest
 from servobench.harness.config.registry import plant_names
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.makers import read_calibration
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME
+from servobench.plant.robot.ur5 import HOME, ur5_arm
 
 NEEDS_BULLET = pytest.mark.skipif(
     find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
@@ -38,6 +39,19 @@ def nominal_ur5():
 def factory_ur5():
     """Return the arm of the factory calibration of one real UR5."""
     return read_calibration(None, find_robot("ur5").arm.tool)
+
+
+def odd_ur5():
+    """Return the arm of a UR5 with every kind of mismatch at once."""
+    rng, arm = np.random.default_rng(4), ur5_arm()
+    return SerialArm(
+        arm.joint_names,
+        arm.translation * rng.uniform(0.9, 1.1, arm.translation.shape),
+        arm.rpy + rng.uniform(-0.05, 0.05, arm.rpy.shape),
+        rng.uniform(-0.1, 0.1, 6),
+        rng.uniform(0.9, 1.1, 6),
+        arm.tool + rng.uniform(-0.04, 0.04, 3),
+    )
 
 
 def mismatched(text, seed=3):

@@ -98,13 +98,6 @@ def test_a_camera_turns_about_its_optical_axis_at_the_same_speed_on_every_plant(
         bench(sensing=SensingConfig(0.0, camera_turn=0.1))
 
 
-def test_noise_has_the_configured_spread_times_its_factor():
-    plant = bench(sensing=SensingConfig(0.003, noise_factor=2.0))
-    errors = [o.feature - o.joint_position[:1] for o in walk(plant, np.zeros((1500, 2)))]
-    assert np.std(errors) == pytest.approx(0.006, rel=0.05)
-    assert abs(np.mean(errors)) < 0.0006
-
-
 def test_a_lost_frame_is_not_valid_and_the_last_feature_is_held():
     plant = bench(sensing=SensingConfig(0.0, drop_probability=0.5))
     held, valid = np.zeros(1), []

@@ -59,16 +59,10 @@ def test_a_larger_magnitude_goes_further_in_the_same_direction():
     np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
 
 
-def test_axes_add_to_a_profile():
-    both = Mismatch.parse("moderate+gear_ratio=5%")
-    assert (both.size("links"), both.size("gear_ratio")) == (0.05, 0.05)
-    assert not both.camera_exact
-
-
-def test_an_axis_stands_instead_of_that_of_the_profile_and_is_refused_twice():
-    once = Mismatch.parse("moderate+camera_rotation=0.5rad")
-    assert once.size("camera_rotation") == 0.5
-    assert once.camera_exact
+def test_an_axis_is_added_to_a_profile_or_stands_instead_of_its_own_and_is_refused_twice():
+    both, once = Mismatch.parse("moderate+gear_ratio=5%"), Mismatch.parse("moderate+camera_rotation=0.5rad")
+    assert (both.size("links"), both.size("gear_ratio"), both.camera_exact) == (0.05, 0.05, False)
+    assert (once.size("camera_rotation"), once.camera_exact) == (0.5, True)
     with pytest.raises(ValueError, match="has the axis camera_rotation twice; give it once"):
         Mismatch.parse("moderate+camera_rotation=60deg+camera_rotation=0.5rad")
     with pytest.raises(ValueError, match="has the axis camera_rotation twice"):
