@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import StateSpace, cont2discrete, dlsim
+from scipy.signal import lsim
 
 from kit.toy import KNOWLEDGE, PERIOD, A, M, N, ToyArm, seen
 from servobench.controllers.aids import AidsConfig
@@ -259,17 +259,9 @@ def test_a_given_response_is_that_of_a_delayed_lag(delay, lag):
     made = Seeing(ToyArm(np.eye(M)), Delays(0.0, delay, lag), response="given")
     steps = np.concatenate([0.05 * rng.uniform(-1.0, 1.0, (30, N)), np.zeros((30, N))])
     held = np.repeat(steps / PERIOD, substeps, axis=0)
-    late = np.concatenate([np.zeros((round(delay * 1000), N)), held])[: len(held)]
-    time = 0.001 * np.arange(len(held) + 1)
-    moved = np.zeros((len(time), N))
-    for joint in range(N):
-        if lag > 0.0:
-            system = StateSpace([[-1.0 / lag, 0.0], [1.0, 0.0]], [[1.0 / lag], [0.0]], [[0.0, 1.0]], [[0.0]])
-            u = np.append(late[:, joint], 0.0)
-            A_, B_, C_, D_, _ = cont2discrete((system.A, system.B, system.C, system.D), 0.001)
-            moved[:, joint] = dlsim((A_, B_, C_, D_, 0.001), u)[1][:, 0]
-        else:
-            moved[1:, joint] = np.cumsum(0.001 * late[:, joint])
+    late = np.pad(held, ((round(delay * 1000), 1), (0, 0)))[: len(held) + 1]
+    response = [1.0], [lag, 1.0, 0.0] if lag > 0.0 else [1.0, 0.0]
+    moved = np.stack([lsim(response, u, 0.001 * np.arange(len(u)), interp=False)[1] for u in late.T], axis=-1)
     for k, step in enumerate(steps):
         q = moved[substeps * k]
         made.look = seen(q, A @ q, k=k)
