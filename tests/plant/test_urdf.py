@@ -17,7 +17,7 @@ from servobench.plant.rendered.urdf import (
     text,
 )
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import find_robot
 
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
@@ -72,17 +72,9 @@ def test_the_simulators_joints_and_flange_are_where_the_arm_says(arm, loaded):
 
 def test_the_centres_of_mass_are_those_of_the_data_sheet_in_the_dh_frames(arm, loaded):
     q = np.random.default_rng(2).uniform(-np.pi, np.pi, 6)
-    for link, centre in enumerate(ur5.CENTRE_OF_MASS):
-        dh_frame = arm.frames(q)[link] @ fixed_transform(arm, link + 1)
-        np.testing.assert_allclose(loaded(q, link)[0], dh_frame[:3, :3] @ centre + dh_frame[:3, 3], atol=1e-6)
-
-
-def fixed_transform(arm, row):
-    fixed = np.eye(4)
-    quaternion = pybullet.getQuaternionFromEuler(arm.rpy[row].tolist())
-    fixed[:3, :3] = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-    fixed[:3, 3] = arm.translation[row]
-    return fixed
+    for link, (frame, centre) in enumerate(zip(arm.frames(q), ur5.CENTRE_OF_MASS, strict=False)):
+        in_joint = rotation_from_rpy(arm.rpy[link + 1]) @ centre + arm.translation[link + 1]
+        np.testing.assert_allclose(loaded(q, link)[0], frame[:3, :3] @ in_joint + frame[:3, 3], atol=1e-6)
 
 
 def test_masses_and_inertias_arrive_in_the_simulator(loaded):
