@@ -23,10 +23,6 @@ def rows(controller, task, mismatch, seeds, *settings, latency=None):
     return [run.row for run in carry_out_together([resolve(each, read_settings(None, settings)) for each in requests])]
 
 
-def row(controller, task, mismatch, seed, *settings, latency=None):
-    return rows(controller, task, mismatch, [seed], *settings, latency=latency)[0]
-
-
 @pytest.mark.parametrize("name", [*EQUIPPED, PAPER])
 def test_with_its_aids_a_method_settles_soon_behind_a_turned_and_late_camera_and_the_published_one_never(name):
     times = [each["settling_time_s"] for each in rows(name, "random", TURNED, range(2), latency=0.1)]
@@ -51,7 +47,7 @@ def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_metho
     for plus, paper in zip(*found, strict=True):
         assert plus["settling_time_s"] < paper["settling_time_s"]
         assert plus["overshoot"] < 0.5 * paper["overshoot"] + 0.005
-    assert row(PLUS, "circle", "moderate", 1)["rms_error_evaluated"] < 0.004
+    assert rows(PLUS, "circle", "moderate", [1])[0]["rms_error_evaluated"] < 0.004
 
 
 @pytest.mark.parametrize("name", some(IDENTIFYING, "regression_mfac", "rls"))
@@ -63,7 +59,7 @@ def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_tha
 
 @pytest.mark.parametrize("name", some([*IDENTIFYING, "calibrated"], "rbf_pid", "calibrated"))
 def test_a_latency_of_half_a_period_costs_little_more_than_one_of_a_period(name):
-    half, whole = (row(name, "circle", "moderate", 2, latency=latency) for latency in (0.025, 0.05))
+    (half,), (whole,) = (rows(name, "circle", "moderate", [2], latency=latency) for latency in (0.025, 0.05))
     assert half["rms_error_evaluated"] < 1.6 * whole["rms_error_evaluated"]
 
 

@@ -60,11 +60,12 @@ def test_a_law_written_as_a_controller_moves_the_arm_as_the_same_law_among_the_p
     np.testing.assert_allclose(own.steps[columns], part.steps[columns], atol=1e-8)
 
 
-def test_with_the_feedforward_of_the_chain_it_gets_one_row_of_the_reference_and_otherwise_all():
+def test_it_gets_the_seed_and_with_the_feedforward_of_the_chain_one_row_of_the_reference_otherwise_all():
     for aids, preview in ((EQUIPPED, 0), ({**EQUIPPED, "feedforward": False}, 10)):
         own, driver = build(aids)
-        driver.run(3)
-        assert (own.rows, own.knowledge.preview) == (1 + preview, preview)
+        driver.seed = 7
+        driver.begin().run(3)
+        assert (own.rows, own.knowledge.preview, own.resets[-1]) == (1 + preview, preview, 7)
 
 
 def test_the_jacobian_is_the_nominal_one_before_a_run_and_a_better_one_in_its_steps():
@@ -78,13 +79,6 @@ def test_the_jacobian_is_the_nominal_one_before_a_run_and_a_better_one_in_its_st
         moved = driver.rig.goal - driver.rig.start  # the direction in which something could be learned
         assert np.linalg.norm((found - true) @ moved) < 0.5 * np.linalg.norm((model - true) @ moved)
         driver.begin()
-
-
-def test_its_reset_gets_the_seed_of_the_run():
-    own, driver = build()
-    driver.seed = 7
-    driver.begin()
-    assert own.resets[-1] == 7
 
 
 def test_its_settings_are_the_section_law_and_those_of_the_aids_can_be_set():

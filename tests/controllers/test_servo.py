@@ -10,7 +10,7 @@ from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.initial_jacobian import InitialConfig, initial_jacobian
-from servobench.controllers.laws.law import Estimate, Law
+from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.servo import Servo, ServoController
@@ -67,15 +67,6 @@ def test_nothing_is_learnt_before_a_second_valid_feature():
     assert estimator.motions == []
     assert np.isnan(controller.diagnostics()["jacobian_prediction_error"])
     np.testing.assert_array_equal(controller.estimated_jacobian(), J0)
-
-
-def test_the_first_step_equals_the_law_at_the_first_jacobian():
-    controller, law = servo(ConstantEstimator()), MfacLaw(MfacConfig(), KNOWLEDGE)
-    first, reference = seen(np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
-    controller.reset(first, 0)
-    _, expected = law.command(law.start(first), Estimate(J0), first, reference)
-    np.testing.assert_array_equal(controller.step(first, reference).joint_velocity, expected)
-    assert controller.diagnostics()["probing"] == 0.0
 
 
 def test_a_command_that_is_not_finite_is_a_named_fault():
