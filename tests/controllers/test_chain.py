@@ -81,7 +81,7 @@ def test_a_moving_reference_is_followed_with_a_tenth_of_a_period_of_lag():
     assert following_error(feedforward=False) > 0.0075
 
 
-LANES, PERIODS = 3, 50
+LANES, PERIODS = 3, 42
 KNOWING = dataclasses.replace(
     KNOWLEDGE,
     true_jacobian=KNOWLEDGE.nominal_jacobian,

@@ -47,19 +47,6 @@ def test_a_run_begins_at_its_start_at_time_zero_and_time_counts_periods(plant):
     assert [plant.step(Command(u)).time for u in COMMANDS] == [(k + 1) * PERIOD for k in range(len(COMMANDS))]
 
 
-def test_the_true_jacobian_predicts_the_true_feature(plant):
-    plant.reset(0)
-    before = plant.truth()
-    start = plant.reset(0).joint_position
-    for _ in range(4):
-        observation = plant.step(Command(0.05 * np.ones(plant.spec.n)))
-    moved = observation.joint_position - start
-    assert np.linalg.norm(moved) > 0.005
-    after = plant.truth()
-    J = (before.jacobian + after.jacobian) / 2
-    np.testing.assert_allclose(after.feature - before.feature, J @ moved, atol=2e-5)
-
-
 def test_a_start_of_the_wrong_size_is_refused(entry):
     with pytest.raises(ValueError, match="start must have shape"):
         entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))
