@@ -59,13 +59,6 @@ def test_dh_arm_equals_the_explicit_product_of_elementary_matrices():
         np.testing.assert_allclose(ur5_arm().ball_position(q), (expected @ [*TOOL, 1.0])[:3], atol=1e-14)
 
 
-def test_planar_arm_matches_the_hand_computed_position_and_jacobian():
-    arm = arm_from_dh([2.0, 1.0], [0.0, 0.0], [0.0, 0.0], ("shoulder", "elbow"))
-    q = np.array([np.pi / 2, -np.pi / 2])  # upper arm along y, forearm along x
-    np.testing.assert_allclose(arm.ball_position(q), [1.0, 2.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(arm.ball_jacobian(q), [[-2.0, 0.0], [1.0, 1.0], [0.0, 0.0]], atol=1e-15)
-
-
 def random_model(seed, n=6):
     rng = np.random.default_rng(seed)
     arm = SerialArm(
