@@ -343,61 +343,45 @@ def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
 @pytest.mark.parametrize(
     "run_id", ["../../escaped", "/tmp/escaped", "..", ".hidden", "a\\b", "a\0b", "a b", "", "-rf", "=1", 3]
 )
-@pytest.mark.parametrize(
-    "command", [("export", "--out", "FILES"), ("record", "--run", "RUN"), ("report",), ("statistics",)]
-)
-def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(monkeypatch, capsys, tmp_path, run_id, command):
+def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(tmp_path, run_id):
     folder = write_folder(tmp_path / "out", [made_up_row(run_id)], [made_up_steps("a")])
-    words = {"FILES": str(tmp_path / "files"), "RUN": str(run_id) or "a"}
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    if "\0" in words["RUN"]:
-        words["RUN"] = "a"
-    code = servobench(monkeypatch, command[0], str(folder), *(words.get(word, word) for word in command[1:]))
-    assert code == 2
-    error = capsys.readouterr().err
     fault = "it has int64 in the column run_id" if run_id == 3 else "the run_id of row 0"
-    assert f"runs.parquet is no table of runs: {fault}" in error
-    assert error.count("\n") == 1
-    assert sorted(tmp_path.rglob("*")) == before
+    with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: {fault}"):
+        results.load_runs(folder)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [("export", "--out", "FILES"), ("report",), ("statistics",), ("verify",)])
-def test_commands_first_say_how_many_runs_of_a_batch_are_missing(output_of, tmp_path, command):
-    folder = tmp_path / "out"
-    results.create_folder(folder, {"run_count": 3})
+@pytest.fixture
+def unfinished(tmp_path, monkeypatch):
+    """The folder `out` below the working directory, with two of three runs; reports on it have no pictures."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("servobench.harness.pictures.report.report_pictures", lambda *_: [])  # which take seconds
+    results.create_folder(Path("out"), {"run_count": 3})
     for index in range(2):
-        run_id = f"run{index}"
-        results.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index), made_up_steps(run_id))])
-    line = "2 of 3 runs are there: --resume carries out the others\n"
-    words = [command[0], str(folder), *(str(tmp_path / "files") if word == "FILES" else word for word in command[1:])]
-    assert output_of(*words).startswith(line)
-    if command == ("report",):
-        assert line.strip() in (folder / "report.html").read_text(encoding="utf-8")
-    run_id = "run2"
-    results.write_part(folder, 2, [RunResult(made_up_row(run_id, seed=2), made_up_steps(run_id))])
-    shutil.rmtree(tmp_path / "files", ignore_errors=True)
-    assert "runs are there" not in output_of(*words)
+        add_part(Path("out"), index)
+    return Path("out")
 
 
-@pytest.mark.parametrize("command", [("export", "--out", "FILES"), ("statistics",)])
-def test_commands_first_say_that_a_folder_has_lost_its_checksums(monkeypatch, capsys, tmp_path, command):
-    folder = tmp_path / "out"
-    results.create_folder(folder, {"run_count": 2})
-    add_part(folder, 0)
-    (folder / SUMS).unlink()
-    words = [command[0], str(folder), *(str(tmp_path / "files") if word == "FILES" else word for word in command[1:])]
-    assert servobench(monkeypatch, *words) == 0
-    line = "1 of 2 runs are there: --resume carries out the others; SHA256SUMS is missing, so that nothing vouches for"
-    assert capsys.readouterr().out.startswith(line)
+MISSING = "2 of 3 runs are there: --resume carries out the others"
 
 
-def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, tmp_path):
-    folder = tmp_path / "out"
-    results.create_folder(folder, {"run_count": 3})
-    add_part(folder, 0)
-    assert servobench(monkeypatch, "statistics", str(folder), "--json") == 0
+@pytest.mark.parametrize("command", ["export out --out files", "report out", "statistics out", "verify out"])
+def test_commands_first_say_how_many_runs_of_a_batch_are_missing(output_of, unfinished, command):
+    assert output_of(*command.split()).startswith(f"{MISSING}\n")
+    if command == "report out":
+        assert MISSING in (unfinished / "report.html").read_text(encoding="utf-8")
+    add_part(unfinished, 2)
+    shutil.rmtree("files", ignore_errors=True)
+    assert "runs are there" not in output_of(*command.split())
+
+
+@pytest.mark.parametrize("command", ["export out --out files", "statistics out"])
+def test_commands_first_say_that_a_folder_has_lost_its_checksums(output_of, unfinished, command):
+    (unfinished / SUMS).unlink()
+    assert output_of(*command.split()).startswith(f"{MISSING}; SHA256SUMS is missing, so that nothing vouches for")
+
+
+def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, unfinished):
+    assert servobench(monkeypatch, "statistics", str(unfinished), "--json") == 0
     told = capsys.readouterr()
     assert json.loads(told.out)
-    assert told.err.startswith("1 of 3 runs are there")
+    assert told.err == f"{MISSING}\n"
