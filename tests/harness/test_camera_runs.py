@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import servobench as package
-from kit.command import servobench
 from kit.lanes import assert_rows_of_single_runs
 from servobench.harness.batch.results import read_manifest
 from servobench.harness.config.settings import Settings
@@ -87,19 +86,12 @@ def test_a_circle_is_within_the_image_and_leads_through_where_the_target_is(sens
     assert np.linalg.norm(middle - drawn.true.points(drawn.scenario.start)) < 0.2 * drawn.true.distance
 
 
-def test_a_folder_is_resumed_with_the_same_camera_only(refusal_of, monkeypatch, capsys):
-    command = ["compare", "--plants", "kinematic", "--controllers", "constant", "--tasks", "random", "--seeds", "2"]
-    command += ["--camera", "mine.toml", "--sensing", "pixel:hand", "--set", "random.duration=0.5", "--no-report"]
-    command += ["--workers", "1", "--out", "out"]
-    assert servobench(monkeypatch, *command) == 0
+def test_a_folder_tells_its_camera():
+    asked = {"sensings": ["pixel:hand"], "robot": WORD, "settings": {"random": {"duration": 0.5}}}
+    package.compare(["constant"], tasks=["random"], out="out", **asked)
     manifest = read_manifest(Path("out"))
     assert manifest["robots"][0]["camera"]["pose"]["position"] == [0.0, -0.07, 0.05]
-    assert list(manifest["files"]) == ["mine.toml"]
     assert manifest["configuration"]["kinematic"]["sensing.frame_period"] == 0.067
-    assert servobench(monkeypatch, *command, "--resume") == 0
-    Path("mine.toml").write_text(CAMERA + ON_FLANGE.replace("0.07", "0.08"))
-    capsys.readouterr()
-    assert "out was begun with another version of mine.toml" in " ".join(refusal_of(*command, "--resume").split())
 
 
 def test_a_run_is_shown_through_its_camera():

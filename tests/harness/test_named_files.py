@@ -62,12 +62,18 @@ def sensing():
     return {"plants": ["kinematic"], "sensings": ["./side.py"]}
 
 
+def camera():
+    write({"eye.toml": "width = 640\nheight = 480\nvertical_fov = 60.0\n"})
+    return {"robot": "ur5 with eye.toml", "sensings": ["pixel"]}
+
+
 CASES = {  # what is asked for, and which file changes
     "robot": (robot, "arm.yaml"),
     "mismatch": (mismatch, "factory.yaml"),
     "task": (task, "path.csv"),
     "plant": (plant, "cell.py"),
     "sensing": (sensing, "side.py"),
+    "camera": (camera, "eye.toml"),
 }
 
 
