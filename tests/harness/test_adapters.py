@@ -16,7 +16,6 @@ from servobench.plant.contract.faults import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 ENTRY = '\n\nENTRY = servobench.PlantEntry("cell", "one line", CellConfig, Cell)\n'
-TWO = CELL + "\n\nclass Other(Cell):\n    pass\n"
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
@@ -25,9 +24,6 @@ pytestmark = pytest.mark.usefixtures("own_folder")
     ("text", "place", "name"),
     [
         (CELL, "./cell.py", "Cell"),
-        (CELL, "cell.py:Cell", "Cell"),
-        (CELL, "first=./cell.py", "first"),
-        (TWO, "./cell.py:Other", "Other"),
         (CONFIGURED_CELL, "./cell.py", "Cell"),
         (CONFIGURED_CELL + ENTRY, "./cell.py", "cell"),
         (PLAIN_CELL, "./cell.py", "Plain"),
@@ -37,7 +33,6 @@ pytestmark = pytest.mark.usefixtures("own_folder")
 def test_a_plant_is_found_by_the_place_of_its_code(tmp_path, text, place, name):
     path = write(tmp_path, text, "cell.py")
     assert choose_plant(place) == name
-    assert choose_plant(place) == name  # asked for again, it is the same one
     entry = find_plant(name)
     assert entry.name == name
     assert entry.own_robot == (text is PLAIN_CELL)
@@ -171,10 +166,6 @@ def test_what_fails_in_a_run_is_a_row_that_says_where(tmp_path, line, with_, rea
     table = servobench.compare(["constant"], ["./cell.py", "kinematic"], settings=SHORT)
     assert table["outcome"].tolist()[0] != table["outcome"].tolist()[1]
     assert re.search(reason, table["reason"].iloc[0]), table["reason"].iloc[0]
-
-
-def test_an_empty_name_is_no_plant(refusal_of):
-    assert refusal_of("run", "constant", "--plant", "").startswith("servobench: unknown plant ''")
 
 
 def test_a_plant_is_named_on_every_command_that_takes_one(refusal_of, output_of, no_figures, tmp_path, monkeypatch):

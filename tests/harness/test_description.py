@@ -76,14 +76,6 @@ def test_a_file_of_settings_serves_commands_that_read_a_part_of_it(output_of, tm
     assert (tmp_path / "loop.fmu").exists()
 
 
-def test_a_file_that_is_there_is_left_as_it_is(refusal_of, tmp_path):
-    path = write(tmp_path, "mine", "bench.toml")
-    assert refusal_of("init", path) == f"servobench: {path} exists already and is left as it is; name another file\n"
-    assert path.read_text() == "mine"
-    path = tmp_path / "none" / "bench.toml"
-    assert refusal_of("init", path) == f"servobench: {path} cannot be written: No such file or directory\n"
-
-
 def test_a_dash_prints_the_file(output_of, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     text = output_of("init", "-", "--plants", "kinematic", "--tasks", "waypoints")

@@ -64,20 +64,6 @@ def test_version_and_commit_are_told(output_of):
     assert re.fullmatch(r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", output_of("--version"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("rum",), "no such command 'rum'. Did you mean 'run'?; see servobench --help"),
-        (("run", "--sed", "3"), "no such option: --sed (Possible options: --seed, --set); see servobench run --help"),
-        (("run", "--seed", "x"), "invalid value for '--seed': "),
-        (("sweep",), "missing option '--out'; see servobench sweep --help"),
-        (("fmu", "info"), "missing argument 'FILE'; see servobench fmu info --help"),
-    ],
-)
-def test_a_call_that_cannot_be_understood_is_one_line(refusal_of, arguments, line):
-    assert refusal_of(*arguments).startswith(f"servobench: {line}")
-
-
 def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
     def interrupt(folder):
         raise KeyboardInterrupt

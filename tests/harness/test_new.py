@@ -27,15 +27,7 @@ def test_a_new_controller_with_aids_says_so_and_a_plant_has_none(refusal_of, out
     assert not (tmp_path / "my_cell.py").exists()
 
 
-def test_nothing_is_overwritten(refusal_of, tmp_path):
-    (tmp_path / "test_mine.py").write_text("mine")
-    assert "test_mine.py exists already and is left as it is" in refusal_of("new", "controller", "mine")
-    assert [path.name for path in tmp_path.iterdir()] == ["test_mine.py"]
-    assert (tmp_path / "test_mine.py").read_text() == "mine"
-
-
 @pytest.mark.parametrize("name", ["3d", "class", "my-law", "../mine", "test_mine", ""])
 def test_a_name_that_no_module_may_have_is_refused(refusal_of, tmp_path, name):
     assert "the name must be one of a Python module, such as my_law" in refusal_of("new", "controller", name)
-    assert "'robot' is nothing to begin with" in refusal_of("new", "robot", "mine")
     assert list(tmp_path.iterdir()) == []

@@ -393,8 +393,3 @@ def test_no_random_bytes_end_the_server(lockstep):
 def test_an_arm_without_six_joints_is_no_ur():
     with pytest.raises(ConfigurationError, match="--robot must be one with 6 joints, as every UR has, got 7"):
         Server(replace(REQUEST, robot="panda"), Settings({}), print)
-
-
-def test_a_name_is_no_address(refusal_of):
-    line = refusal_of("serve", "--address", "robot")
-    assert "--address: 'robot' does not appear to be an IPv4 or IPv6 address" in line

@@ -170,13 +170,3 @@ def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_
     assert servobench(monkeypatch, *words, "--resume") == 0
     assert {name: (tmp_path / "suite" / name).read_text() for name in first} == first
     assert "exists already" in refusal_of(*words)
-
-
-def test_settings_are_checked_for_all_challenges_before_the_first_one_runs(refusal_of, tmp_path):
-    words = ["suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", str(tmp_path / "suite")]
-    for setting, message in (
-        ("lemniscate.lap_time=3", "'lemniscate' does not run here"),
-        ("circle.lap_time=-3", "circle.lap_time must be above 0, got -3"),
-    ):
-        assert message in refusal_of(*words, "--set", setting)
-    assert not (tmp_path / "suite").exists()

@@ -1,6 +1,5 @@
-"""A hundred wrong inputs over all commands: each is one right line and exit code 2, and nothing is written."""
+"""Two hundred wrong inputs over all commands: each is one right line and exit code 2, and nothing is written."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +44,7 @@ FILES: dict[str, str | bytes] = {  # name -> content
     "list.yaml": "kinematics:\n  - 1\n",
     "arm_mm.toml": "a = [0, -425]\nd = [0, 0]\nalpha = [0, 0]\njoint_lower = []\njoint_upper = []\njoint_speed = []\n",
     "no.fmu": "this is no archive",
+    "test_taken.py": "mine",
     "no_fmu.toml": "[fmu]\nfile = 3\n",
 }
 WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
@@ -66,6 +66,25 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("plants", "bulet"), "unknown plant 'bulet': did you mean 'bullet'?"),
     (("controllers", "rbf_pdi"), "unknown controller 'rbf_pdi': did you mean 'rbf_pid'?"),
     (("tasks", "exp22"), "unknown task 'exp22': did you mean 'exp2'?"),
+    # commands and options
+    (("rum",), "no such command 'rum'. Did you mean 'run'?; see servobench --help"),
+    (("run", "--sed", "3"), "no such option: --sed (Possible options: --seed, --set); see servobench run --help"),
+    (("run", "constant", "--controller", "rls"), "two controllers are named, constant and --controller rls; a run has"),
+    (("tasks", "--robot", "ur10e"), "--robot shows the settings of one task"),
+    (("tune", "--robot", "panda"), "tune has no --robot: methods are tuned on the UR5 alone"),
+    (("claims", "--robot", "panda"), "claims has no --robot: the claims are those of the paper, which are about a UR5"),
+    (("tune", "--sensing", "pixel"), "tune has no --sensing: "),
+    (("claims", "--sensing", "pixel"), "claims has no --sensing: "),
+    (("record", "--sensing", "pixel"), "record has no --sensing: "),
+    (("controllers", "--sensing", "pixel"), "controllers has no --sensing: "),
+    (("check", "robot", "./mine.py"), "check needs a controller, or the word plant and a plant"),
+    (("check", "plant"), "check plant needs a plant, such as servobench check plant ./cell.py"),
+    (("statistics", "results", "--json", "--markdown"), "are ways to print the same; give one of them"),
+    (("statistics", "results", "--latex", "--markdown"), "are ways to print the same; give one of them"),
+    (("serve", "--address", "robot"), "--address: 'robot' does not appear to be an IPv4 or IPv6 address"),
+    (("new", "controller", "taken"), "test_taken.py exists already and is left as it is"),
+    (("init", "file"), "file exists already and is left as it is; name another file"),
+    (("init", "none/bench.toml"), "none/bench.toml cannot be written: No such file or directory"),
     # mismatches
     ((*RUN, "--mismatch", "mild"), "'mild' is not known here; wanted one profile (none, factory, moderate"),
     ((*RUN, "--mismatch", "camera_rotaton=5deg"), "did you mean 'camera_rotation'?"),
@@ -199,8 +218,12 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "-o", "new.fmu", "--mismatch", "moderat"), "did you mean 'moderate'?"),
     (("fmu", "export", "-o", "new.fmu", "--fmi", "4"), "4"),
     (("fmu", "export", "-o", "new.fmu", "--platforms", "x86_64-linx"), "x86_64-linx"),
+    (("suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", "new", "--set",
+      "lemniscate.lap_time=3"), "'lemniscate' does not run here"),
+    (("suite", "--challenges", "severe,zeros45", "--controllers", "constant", "--out", "new", "--set",
+      "circle.lap_time=-3"), "circle.lap_time must be above 0, got -3"),
     # a log beside a controller, and exports
-    (("shadow",), "missing argument 'LOG'"),
+    (("shadow",), "missing argument 'LOG'; see servobench shadow --help"),
     (("shadow", "none"), "none does not exist; wanted a results folder or a table"),
     (("shadow", "full"), "full is not a results folder"),
     (("shadow", "file", "--controller", "constant"), "file must be a results folder, or a table in .csv or .parquet"),
@@ -215,11 +238,12 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "--controller", "ukf_mfak", "-o", "new.fmu"), "did you mean 'ukf_mfac'?"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
     (("fmu", "export", "-o", "none/new.fmu"), "the folder none for the FMU does not exist"),
-    (("fmu", "ssp", "-o", "new.ssp"), "missing option '--controller'"),
+    (("fmu", "ssp", "-o", "new.ssp"), "missing option '--controller'; see servobench fmu ssp --help"),
     (("export", "none", "--out", "new"), "none is not a results folder"),
     # names of other letters, nothing at all, the same thing twice, and paths of another kind
     ((*RUN, "--task", "krëis"), "unknown task 'krëis': valid:"),
     (("run", "--plant", "kinematic", "--controller", ""), "unknown controller '': valid:"),
+    (("run", "constant", "--plant", ""), "unknown plant '': valid:"),
     ((*RUN, "--robot", ""), "unknown robot '': valid:"),
     ((*RUN, "--sensing", ""), "unknown sensing '': valid:"),
     ((*RUN, "--sensing", "pixel,stereo"), "unknown sensing 'pixel,stereo'"),
@@ -309,20 +333,20 @@ def place(tmp_path_factory) -> Path:
     return folder
 
 
-def files_of(folder: Path) -> list[str]:
-    return sorted(str(Path(root, name)) for root, _, names in os.walk(folder) for name in names)
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
 def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(place)
-    before = files_of(place)
+    before = contents(place)
     code, told = servobench(monkeypatch, *arguments), capsys.readouterr()
     assert code == 2, told
     assert told.err.startswith("servobench: ")
     assert told.err.count("\n") == 1
     assert words in told.err
-    assert files_of(place) == before
+    assert contents(place) == before
 
 
 @pytest.mark.parametrize(("task", "settings", "sensing", "words"), UNLIKELY)
