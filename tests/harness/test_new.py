@@ -8,14 +8,15 @@ pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "check", "options"),
-    [("controller", "check", ()), ("controller", "check", ("--aids",)), ("plant", "check plant", ())],
-)
-def test_a_new_file_passes_its_own_test(output_of, tmp_path, kind, check, options):
-    assert f"servobench {check} ./laws/my_law.py" in output_of("new", kind, "my_law", "--folder", "laws", *options)
-    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_law.py", path=tmp_path / "laws")
-    assert "2 passed" in done.stdout, done.stdout + done.stderr
+def test_new_files_pass_their_own_tests(output_of, tmp_path):
+    for kind, name, check, options in (
+        ("controller", "my_law", "check", ()),
+        ("controller", "my_aided_law", "check", ("--aids",)),
+        ("plant", "my_cell", "check plant", ()),
+    ):
+        assert f"servobench {check} ./laws/{name}.py" in output_of("new", kind, name, "--folder", "laws", *options)
+    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", path=tmp_path / "laws")
+    assert "6 passed" in done.stdout, done.stdout + done.stderr
 
 
 def test_a_new_controller_with_aids_says_so_and_a_plant_has_none(refusal_of, output_of, monkeypatch, tmp_path):
