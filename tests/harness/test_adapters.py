@@ -3,11 +3,9 @@
 import json
 import re
 
-import pandas as pd
 import pytest
 
 import servobench
-from kit.command import judged
 from kit.command import servobench as command
 from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
 from servobench.harness.batch.campaign import changed_source
@@ -68,22 +66,6 @@ def test_settings_of_a_plant_reach_it(tmp_path):
         speeds[speed] = run.steps.filter(regex="^joint_position").diff().abs().max().max() / 0.05
     assert speeds[0.5] == pytest.approx(0.5)
     assert speeds[1.0] == pytest.approx(1.0)
-
-
-def test_worker_processes_carry_out_the_same_runs_as_this_one(tmp_path):
-    write(tmp_path, CELL, "a/cell.py")
-    write(tmp_path, WHOLE, "b/mine.py")
-    tables = [
-        servobench.compare(
-            ["b/mine.py", "constant"], ["a/cell.py", "kinematic"], seeds=2, settings=SHORT, workers=workers, out=out
-        )
-        for workers, out in ((1, "one"), (2, "two"))
-    ]
-    pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
-    assert tables[0]["outcome"].tolist() != ["crashed"] * 8
-    record = json.loads((tmp_path / "two" / "manifest.json").read_text())
-    assert record["own_plants"]["Cell"]["place"] == "a/cell.py"
-    assert list(record["own_controllers"]) == ["Mine"]
 
 
 def test_a_class_is_taken_in_python_and_its_robot_may_be_its_own():

@@ -12,7 +12,7 @@ import servobench
 from kit.command import judged
 from kit.command import servobench as command
 from kit.documents import blocks
-from kit.own import install, write
+from kit.own import CELL, WHOLE, install, write
 from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
@@ -34,17 +34,19 @@ def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path
 
 
 @pytest.mark.slow
-def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_file(tmp_path):
-    write(tmp_path, SPIRAL, "spiral.py")
-    tables = [
-        servobench.compare(["constant"], tasks=["./spiral.py", "exp1"], seeds=2, workers=workers, out=out,
-                           settings={"exp1": {"duration": 1.0}})
-        for workers, out in ((1, "one"), (2, "two"))
-    ]  # fmt: skip
+def test_worker_processes_carry_out_the_same_runs_of_users_code_and_the_manifest_names_it(tmp_path):
+    for name, text in {"a/cell.py": CELL, "b/mine.py": WHOLE, "c/spiral.py": SPIRAL}.items():
+        write(tmp_path, text, name)
+    asked = ["b/mine.py", "constant"], ["a/cell.py", "kinematic"], ["c/spiral.py", "exp1"]
+    settings = {"exp1": {"duration": 0.5}, "Spiral": {"duration": 0.5}}
+    tables = [servobench.compare(*asked, seeds=2, settings=settings, workers=n, out=str(n)) for n in (1, 2)]
     pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
-    manifest = json.loads((tmp_path / "two" / "manifest.json").read_text())
-    assert manifest["own_tasks"]["Spiral"]["place"] == "./spiral.py"
-    assert "spiral.py" in " ".join(manifest["files"])
+    assert set(tables[0]["status"]) == {"completed"}
+    manifest = json.loads((tmp_path / "2" / "manifest.json").read_text())
+    own = {name: record["place"] for kind in ("controllers", "plants", "tasks")
+           for name, record in manifest[f"own_{kind}"].items()}  # fmt: skip
+    assert own == {"Mine": "b/mine.py", "Cell": "a/cell.py", "Spiral": "c/spiral.py"}
+    assert "c/spiral.py" in " ".join(manifest["files"])
 
 
 def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(output_of, no_figures, tmp_path, monkeypatch):
