@@ -103,12 +103,11 @@ def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_i
         np.testing.assert_equal(few.row, many.row)
 
 
-@pytest.mark.parametrize("curve", ["circle", "lemniscate"])
-def test_endurance_is_more_laps_of_the_same_curve(curve):
-    settings = {"endurance": {"laps": 3, "lap_time": 4.0, "curve": curve}}
+def test_endurance_is_more_laps_of_the_same_curve():
+    settings = {"endurance": {"laps": 3, "lap_time": 4.0, "curve": "lemniscate"}}
     row, two = (
         carry_out(run("calibrated", task, chosen), steps=False).row
-        for task, chosen in (("endurance", settings), (curve, {curve: {"laps": 2, "lap_time": 4.0}}))
+        for task, chosen in (("endurance", settings), ("lemniscate", {"lemniscate": {"laps": 2, "lap_time": 4.0}}))
     )
     assert row["periods"] == 240
     assert row["rms_error_second_lap"] == two["rms_error_evaluated"] == two["rms_error_second_lap"]

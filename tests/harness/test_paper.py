@@ -8,6 +8,7 @@ import pytest
 
 from kit.command import carried_out, servobench
 from servobench.harness.analysis.folder import latex_tables
+from servobench.harness.batch.api import compare
 
 TABLE = pd.DataFrame(
     {
@@ -43,12 +44,9 @@ def test_the_caption_of_paired_differences_names_their_place():
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
     """The LaTeX of two short runs in which a setting is not the default."""
-    folder = tmp_path_factory.mktemp("paper")
-    names = ("compare", "--controllers", "constant,calibrated", "--tasks", "exp2", "--seeds", "2", "--no-report")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("servobench.harness.pictures.figures.draw_figures", lambda _: [])
-        assert servobench(patch, *names, "--set", "exp2.duration=2", "--out", str(folder / "out")) == 0
-    return folder / "out"
+    out = tmp_path_factory.mktemp("paper") / "out"
+    compare(["constant", "calibrated"], tasks=["exp2"], seeds=2, settings={"exp2": {"duration": 2.0}}, out=out)
+    return out
 
 
 def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(output_of, printed):

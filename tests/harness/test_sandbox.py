@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from kit.command import PACKAGE, left_behind, python, wait_for
+from kit.nightly import some
 from servobench.harness.batch import sandbox
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
@@ -46,7 +47,7 @@ if not first.exists() or {always}:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"])
+@pytest.mark.parametrize("name", some(("SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"), "SIGTERM", "SIGSTOP"))
 def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(name, tmp_path, monkeypatch):
     (tmp_path / "ends_once.py").write_text(ONCE.format(name=name, always=False))
     monkeypatch.syspath_prepend(tmp_path)
