@@ -49,21 +49,12 @@ def test_the_interval_of_an_interquartile_mean_is_stratified_by_challenge():
     assert (middle.low, middle.high) == pytest.approx((middle.value, middle.value))
 
 
-def test_the_interval_is_as_wide_as_scipys():
+def test_the_interval_is_scipys():
     sample = np.random.default_rng(4).uniform(0.2, 0.8, 60)
     middle = ranking(tidy("score", {"a": {"x": sample}}))[0].score
     wanted = stats.bootstrap((sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0)
     low, high = wanted.confidence_interval
-    assert middle.high - middle.low == pytest.approx(high - low, rel=0.1)
-
-
-def test_the_interval_covers_the_true_mean_in_nearly_95_percent_of_samples(monkeypatch):
-    monkeypatch.setattr("servobench.harness.analysis.scores.RESAMPLES", 300)
-    generator, hits = np.random.default_rng(5), 0
-    for _ in range(60):
-        middle = ranking(tidy("score", {"a": {"x": generator.random(40), "y": generator.random(40)}}))[0].score
-        hits += middle.low <= 0.5 <= middle.high
-    assert 52 <= hits <= 60
+    assert (middle.low, middle.high) == pytest.approx((low, high), abs=0.05 * (high - low))
 
 
 def test_methods_that_cannot_be_told_apart_share_a_rank_and_the_next_one_has_its_place():

@@ -42,22 +42,13 @@ def table(**columns):
     return pd.DataFrame({name: [value] * size for name, value in fixed.items()} | columns)
 
 
-@pytest.mark.parametrize(
-    ("successes", "runs", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
-)
-def test_wilson_intervals_are_those_of_newcombe_1998(successes, runs, low, high):
-    found = success_rate(successes, runs)
-    assert (round(found.low, 4), round(found.high, 4)) == (low, high)
-    assert (found.value, found.count) == (successes / runs, runs)
-
-
 @given(runs=st.integers(1, 2000), share=st.floats(0.0, 1.0))
 def test_the_wilson_interval_is_that_of_statsmodels(runs, share):
     successes = round(share * runs)
     found = success_rate(successes, runs)
     wanted = proportion_confint(successes, runs, method="wilson")
     assert (found.low, found.high) == pytest.approx(wanted, abs=1e-14)
+    assert (found.value, found.count) == (successes / runs, runs)
 
 
 def test_an_estimate_is_printed_with_its_interval_and_a_missing_one_as_a_dash():
@@ -218,13 +209,6 @@ def test_equivalent_is_what_two_one_sided_t_tests_say(shift, spread, seed):
     for side, verdict in (("less", "better"), ("greater", "worse")):
         beyond = stats.ttest_1samp(first - second, -0.05 if side == "less" else 0.05, alternative=side).pvalue < 0.05
         assert (found.verdict == verdict) == beyond
-
-
-def test_methods_that_differ_by_the_margin_are_called_equivalent_or_better_in_a_twentieth_of_samples():
-    rng = np.random.default_rng(8)
-    told = [paired_difference(values, np.zeros(15), 1.0).verdict for values in rng.normal(-1.0, 2.0, (2000, 15))]
-    assert told.count("better") / 2000 == pytest.approx(0.05, abs=0.015)
-    assert told.count("equivalent") / 2000 <= 0.065
 
 
 def test_the_probability_to_be_better_is_counted_with_ties_as_halves():
