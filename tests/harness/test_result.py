@@ -34,34 +34,6 @@ class KeyLost(Resting):
         return {}["gain"]  # the line of the crash
 
 
-class NotANumber(Resting):
-    """Commands what is not a number."""
-
-    def step(self, observation, reference):
-        return Command(np.full(self.n, np.nan))  # the line of the crash
-
-
-class Singular(Resting):
-    """Asks numpy for an inverse that does not exist."""
-
-    def step(self, observation, reference):
-        return Command(np.linalg.inv(np.zeros((6, 6)))[0])  # the line of the crash
-
-
-class Overflowing(Resting):
-    """Leaves the range of numbers."""
-
-    def step(self, observation, reference):
-        return Command(np.full(self.n, 1e300) * 1e300)  # the line of the crash
-
-
-class Leaving(Resting):
-    """Wants to end the whole program."""
-
-    def step(self, observation, reference):
-        sys.exit(3)  # the line of the crash
-
-
 class Unprepared(Resting):
     """Cannot begin."""
 
@@ -92,12 +64,19 @@ def line_of(kind: type) -> int:
     return next(i for i, line in enumerate(lines, 1) if i > begin and line.endswith("# the line of the crash"))
 
 
+def wrong(name: str, method: str, answer: str) -> type[Controller]:
+    """Return a controller of which one method gives a wrong answer; its code lies in the file wrong.py."""
+    code = f"class {name}(Resting):\n    'Answers wrongly.'\n    def {method}:\n        return {answer}\n"
+    names = {"np": np, "Command": Command, "Resting": Resting, "sys": sys, "__name__": "wrong"}
+    exec(compile(code, "elsewhere/wrong.py", "exec"), names)
+    return names[name]
+
+
+STEP, RESET, LOOK = "step(self, observation, reference)", "reset(self, observation, seed)", "diagnostics(self)"
+
+
 CRASHES = {
     KeyLost: ("crashed", "KeyError: 'gain'", "step"),
-    NotANumber: ("crashed", "ValueError: joint_velocity must be finite, got [nan, nan, nan, nan, nan, nan]", "step"),
-    Singular: ("crashed", "LinAlgError: Singular matrix", "step"),
-    Overflowing: ("numerical_error", "overflow encountered in multiply", "step"),
-    Leaving: ("crashed", "SystemExit: 3", "step"),
     Unprepared: ("crashed", "RuntimeError: no gains", "reset"),
     Faulty: ("gripper_open", "the gripper is open", "step"),
 }
@@ -112,6 +91,21 @@ def test_the_reason_names_error_message_file_line_and_method(kind):
     assert f'{Path(__file__).name}", line {line_of(kind)}, in {method}' in result.trace
     assert "harness/run" not in result.trace
     assert result.row["periods"] == (2 if kind is KeyLost else 0)
+
+
+@pytest.mark.parametrize(
+    ("answer", "status", "message"),
+    [
+        ("Command(np.full(6, np.nan))", "crashed",
+         "ValueError: joint_velocity must be finite, got [nan, nan, nan, nan, nan, nan]"),
+        ("Command(np.linalg.inv(np.zeros((6, 6)))[0])", "crashed", "LinAlgError: Singular matrix"),
+        ("Command(np.full(6, 1e300) * 1e300)", "numerical_error", "overflow encountered in multiply"),
+        ("sys.exit(3)", "crashed", "SystemExit: 3"),
+    ],
+)  # fmt: skip
+def test_errors_of_numbers_and_exits_end_a_run_likewise(answer, status, message):
+    row = servobench.run(wrong("Wrong", STEP, answer), task="exp2", settings=SHORT).row
+    assert (row["status"], row["reason"]) == (status, f"{message} (wrong.py:4 in Wrong.step)")
 
 
 def test_a_trace_tells_the_error_behind_the_error():
@@ -176,15 +170,6 @@ def test_an_interrupted_batch_that_is_resumed_has_the_log_of_all_runs(tmp_path):
         assert (folder / results.FAILURES).read_text() == "".join(rows)
 
 
-def wrong(name: str, method: str, answer: str) -> type[Controller]:
-    """Return a controller of which one method gives a wrong answer; its code lies in the file wrong.py."""
-    code = f"class {name}(Resting):\n    'Answers wrongly.'\n    def {method}:\n        return {answer}\n"
-    names = {"np": np, "Command": Command, "Resting": Resting, "__name__": "wrong"}
-    exec(compile(code, "elsewhere/wrong.py", "exec"), names)
-    return names[name]
-
-
-STEP, RESET, LOOK = "step(self, observation, reference)", "reset(self, observation, seed)", "diagnostics(self)"
 TOO_FEW = "takes 2 positional arguments but 3 were given; it must be `def"
 TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in rad/s"
 
