@@ -246,7 +246,6 @@ ODD = {  # what a folder holds: the command, its exit code, and words of its one
     "a camera that moves at a word": (manifest(configuration={"run": {"camera_moves_at": "noon"}}), FIGURE, 0, ""),
     "lists in lists": (lists_in_lists, "report {}", 2, "nested too deeply"),
     "code that is a list": (manifest(plugins=[1]), "statistics {}", 2, "plugins must be an object of an object"),
-    "changes that are none": (manifest(changed=1.5), LATEX, 2, "changed must be an object, got '1.5'"),
     "a version that is a command": (
         manifest(robots=[{}], packages={"servobench": r"\input{x}"}), LATEX, 0, r"\textbackslash{}input\{x\}~",
     ),

@@ -175,7 +175,6 @@ def of_schema_3(folder: Path) -> None:
         (without_file(results.RUNS), "statistics DIR", "DIR/runs.parquet is missing; repeat the command"),
         (of_schema_3, "verify DIR", "DIR has results of schema '3'; this servobench reads '4'; the column "
          "latency_periods [periods] is now latency_s [s]"),
-        (lambda folder: None, "statistics DIR", "DIR is not a results folder: it does not exist"),
         (lambda folder: None, "verify DIR", "DIR is not a results folder: it does not exist"),
     ],
 )  # fmt: skip
