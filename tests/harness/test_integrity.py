@@ -118,8 +118,16 @@ def half(tmp_path_factory):
     return folder
 
 
-def copy(folder, tmp_path):
-    return shutil.copytree(folder, tmp_path / "copy")
+@pytest.fixture
+def begun(half, tmp_path):
+    """A copy of the batch that was stopped before its last part."""
+    return shutil.copytree(half, tmp_path / "begun")
+
+
+@pytest.fixture
+def ended(whole, tmp_path):
+    """A copy of the whole batch."""
+    return shutil.copytree(whole, tmp_path / "ended")
 
 
 def flip(path, seed=0):
@@ -142,8 +150,8 @@ DAMAGES = {
 }
 
 
-def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damaged(half, tmp_path):
-    folder, other = copy(half, tmp_path), tmp_path / "other"
+def test_parts_are_copied_with_the_pictures_of_their_runs_unless_they_are_damaged(begun, tmp_path):
+    folder, other = begun, tmp_path / "other"
     results.create_folder(other, {"schema_version": "4"})
     results.copy_parts([(folder, 0), (folder, 8)], other)
     assert results.part_indices(other) == [0, 8]
@@ -168,152 +176,140 @@ def test_more_runs_than_were_asked_for_are_of_another_folder():
     assert results.missing_line(4, 0) == ""  # a folder that says nothing
 
 
-def test_examined_files_are_counted_with_parts_and_what_stands_beside(half, tmp_path):
-    folder = copy(half, tmp_path)
-    before = examine(folder)
-    assert (before.files, before.left_out) == (1 + len([*(folder / results.PARTS).glob("[0-9]*.*")]), [])
-    (folder / "report.html").write_text("mine")
-    results.vouch(folder, [folder / "report.html"])
-    assert examine(folder).files == before.files + 1
+def test_examined_files_are_counted_with_parts_and_what_stands_beside(begun):
+    before = examine(begun)
+    assert (before.files, before.left_out) == (1 + len([*(begun / results.PARTS).glob("[0-9]*.*")]), [])
+    (begun / "report.html").write_text("mine")
+    results.vouch(begun, [begun / "report.html"])
+    assert examine(begun).files == before.files + 1
 
 
 @pytest.mark.parametrize("what", DAMAGES)
-def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, whole, tmp_path, what):
-    folder = copy(half, tmp_path)
-    part = folder / results.part_name(8, results.RUNS)
+def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, whole, what):
+    part = begun / results.part_name(8, results.RUNS)
     DAMAGES[what](part)
     for command in (results.load_runs, results.collect):
         with pytest.raises(DamagedFile, match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob"):
-            command(folder)
-    found = examine(folder)
+            command(begun)
+    found = examine(begun)
     (finding,) = found.findings
     assert (finding.name, finding.fault) == (results.part_name(8, results.RUNS), what)
     assert found.runs == RUNS - 16
-    resumed = run(folder, resume=True)
+    resumed = run(begun, resume=True)
     assert resumed.repeated == 16
     assert resumed.notes == [f"{part} {what}: its runs are carried out again"]
-    assert_same(folder, whole)
+    assert_same(begun, whole)
 
 
-def test_a_part_with_the_rows_of_another_is_refused(half, whole, tmp_path):
-    folder = copy(half, tmp_path)
-    first, second = (folder / results.part_name(index, results.RUNS) for index in (0, 8))
+def test_a_part_with_the_rows_of_another_is_refused(begun, whole):
+    first, second = (begun / results.part_name(index, results.RUNS) for index in (0, 8))
     shutil.copy(first, second)
-    assert [finding.fault for finding in examine(folder).findings] == ["was changed since it was written"]
-    (folder / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
-    assert "holds the rows of other runs" in [finding.fault for finding in examine(folder).findings]
-    assert run(folder, resume=True).repeated == 16
-    assert_same(folder, whole)
+    assert [finding.fault for finding in examine(begun).findings] == ["was changed since it was written"]
+    (begun / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
+    assert "holds the rows of other runs" in [finding.fault for finding in examine(begun).findings]
+    assert run(begun, resume=True).repeated == 16
+    assert_same(begun, whole)
 
 
-def test_parts_without_checksums_are_read_and_kept(half, whole, tmp_path):
-    folder = copy(half, tmp_path)
-    (folder / SUMS).unlink()
-    (finding,) = examine(folder).findings
+def test_parts_without_checksums_are_read_and_kept(begun, whole):
+    (begun / SUMS).unlink()
+    (finding,) = examine(begun).findings
     assert (finding.name, finding.fault) == (SUMS, "is missing, so that nothing vouches for the other files")
-    assert len(results.load_runs(folder)) == RUNS - 8
-    resumed = run(folder, resume=True)
+    assert len(results.load_runs(begun)) == RUNS - 8
+    resumed = run(begun, resume=True)
     assert (resumed.repeated, resumed.notes) == (8, [])
-    assert_same(folder, whole)
+    assert_same(begun, whole)
 
 
 @pytest.mark.parametrize("what", DAMAGES)
-def test_a_damaged_table_is_named_and_made_again(whole, tmp_path, what):
-    folder = copy(whole, tmp_path)
-    DAMAGES[what](folder / results.RUNS)
+def test_a_damaged_table_is_named_and_made_again(ended, whole, what):
+    DAMAGES[what](ended / results.RUNS)
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
-        results.load_runs(folder)
+        results.load_runs(ended)
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
-        results.collect(folder)
-    (finding,) = examine(folder).findings
+        results.collect(ended)
+    (finding,) = examine(ended).findings
     assert finding.remedy.endswith("--resume; runs that are in no part are repeated")
-    resumed = run(folder, resume=True)
+    resumed = run(ended, resume=True)
     assert resumed.repeated == RUNS
-    assert resumed.notes == [f"{folder / results.RUNS} {what}: runs that are in no part are carried out again"]
-    assert_same(folder, whole)
+    assert resumed.notes == [f"{ended / results.RUNS} {what}: runs that are in no part are carried out again"]
+    assert_same(ended, whole)
 
 
-def test_an_intact_folder_is_left_as_it_is(whole, tmp_path):
-    folder = copy(whole, tmp_path)
-    resumed = run(folder, resume=True)
+def test_an_intact_folder_is_left_as_it_is(ended, whole):
+    resumed = run(ended, resume=True)
     assert (resumed.repeated, resumed.notes) == (0, [])
-    assert read_sums(folder) == read_sums(whole)
-    assert_same(folder, whole)
+    assert read_sums(ended) == read_sums(whole)
+    assert_same(ended, whole)
 
 
-def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(half, whole, tmp_path):
-    folder = copy(whole, tmp_path)
+def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(ended, half, whole):
     name = results.part_name(8, results.RUNS)
-    (folder / results.PARTS).mkdir()
-    shutil.copy(half / name, folder / name)
-    with (folder / SUMS).open("a") as file:
+    (ended / results.PARTS).mkdir()
+    shutil.copy(half / name, ended / name)
+    with (ended / SUMS).open("a") as file:
         file.writelines(f"{digest}  {name}\n" for digest in read_sums(half)[name])
-    assert run(folder, resume=True).repeated == 0
-    assert_same(folder, whole)
+    assert run(ended, resume=True).repeated == 0
+    assert_same(ended, whole)
 
 
 @pytest.mark.parametrize("name", [results.MANIFEST, results.RUNS])
-def test_a_file_that_lost_its_line_is_vouched_for_again(whole, tmp_path, name):
-    folder = copy(whole, tmp_path)
-    lines = (folder / SUMS).read_text().splitlines(keepends=True)
-    (folder / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
-    named = [(each.name, each.fault) for each in examine(folder).findings]
+def test_a_file_that_lost_its_line_is_vouched_for_again(ended, whole, name):
+    lines = (ended / SUMS).read_text().splitlines(keepends=True)
+    (ended / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
+    named = [(each.name, each.fault) for each in examine(ended).findings]
     assert named == [(name, f"is not listed in {SUMS}")]
-    assert run(folder, resume=True).repeated == (0 if name == results.MANIFEST else RUNS)
-    assert fault(folder, name, read_sums(folder)) is None
-    assert_same(folder, whole)
+    assert run(ended, resume=True).repeated == (0 if name == results.MANIFEST else RUNS)
+    assert fault(ended, name, read_sums(ended)) is None
+    assert_same(ended, whole)
 
 
-def test_no_bit_of_a_folder_can_change_in_silence(whole, tmp_path):
+def test_no_bit_of_a_folder_can_change_in_silence(ended, whole):
     kept = {path.name: path.read_bytes() for path in whole.iterdir()}
-    folder = copy(whole, tmp_path)
     for seed in range(100):
         name = (results.RUNS, results.MANIFEST)[seed % 2]
-        flip(folder / name, seed)
+        flip(ended / name, seed)
         with pytest.raises(DamagedFile, match=f"{name} was changed|{name} is cut off"):
-            results.load_runs(folder)
-        (folder / name).write_bytes(kept[name])
-    results.load_runs(folder)
+            results.load_runs(ended)
+        (ended / name).write_bytes(kept[name])
+    results.load_runs(ended)
 
 
-def test_a_manifest_that_is_lost_beside_whole_tables_is_written_anew(whole, tmp_path):
-    folder = copy(whole, tmp_path)
-    (folder / results.MANIFEST).unlink()
-    found = examine(folder)
+def test_a_manifest_that_is_lost_beside_whole_tables_is_written_anew(ended, whole):
+    (ended / results.MANIFEST).unlink()
+    found = examine(ended)
     assert (found.runs, found.wanted) == (RUNS, 0)
-    resumed = run(folder, resume=True)
-    assert (resumed.repeated, resumed.notes) == (0, [f"{folder / results.MANIFEST} is missing: it is written anew"])
-    assert_same(folder, whole)
+    resumed = run(ended, resume=True)
+    assert (resumed.repeated, resumed.notes) == (0, [f"{ended / results.MANIFEST} is missing: it is written anew"])
+    assert_same(ended, whole)
 
 
-def test_a_lost_log_of_failures_is_made_from_the_table(whole, tmp_path):
-    folder = copy(whole, tmp_path)
-    (folder / results.FAILURES).write_bytes(b"")
-    (finding,) = examine(folder).findings
+def test_a_lost_log_of_failures_is_made_from_the_table(ended, whole):
+    (ended / results.FAILURES).write_bytes(b"")
+    (finding,) = examine(ended).findings
     assert finding.name == results.FAILURES
     assert finding.remedy.endswith("--resume; it is written anew, without traces")
-    resumed = run(folder, resume=True)
+    resumed = run(ended, resume=True)
     assert resumed.repeated == 0
-    assert resumed.notes == [f"{folder / results.FAILURES} is empty: it is written anew, without traces"]
-    assert_same(folder, whole)
+    assert resumed.notes == [f"{ended / results.FAILURES} is empty: it is written anew, without traces"]
+    assert_same(ended, whole)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"schema_version": "4", "run_count": "many"}'])
-def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for(half, whole, tmp_path, content):
-    folder = copy(half, tmp_path)
-    (folder / results.MANIFEST).unlink() if content is None else (folder / results.MANIFEST).write_bytes(content)
+def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for(begun, whole, content):
+    (begun / results.MANIFEST).unlink() if content is None else (begun / results.MANIFEST).write_bytes(content)
     with pytest.raises(ConfigurationError, match=r"manifest\.json"):
-        results.load_runs(folder)
-    assert [finding.name for finding in examine(folder).findings] == [results.MANIFEST]
+        results.load_runs(begun)
+    assert [finding.name for finding in examine(begun).findings] == [results.MANIFEST]
     with pytest.raises(ConfigurationError, match="are not of this batch or do not say so"):
-        run(folder, resume=True, seeds=range(5))
-    assert run(folder, resume=True).repeated == 8
-    assert_same(folder, whole)
+        run(begun, resume=True, seeds=range(5))
+    assert run(begun, resume=True).repeated == 8
+    assert_same(begun, whole)
 
 
-@pytest.mark.parametrize("base", ["half", "whole"])
-def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(base, whole, tmp_path, request):
-    folder = copy(request.getfixturevalue(base), tmp_path)
+@pytest.mark.parametrize("base", ["begun", "ended"])
+def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(base, whole, request):
+    folder = request.getfixturevalue(base)
     (folder / SUMS).write_bytes(b"\0" * 9)
     with pytest.raises(ConfigurationError, match="are not of this batch or do not say so"):
         run(folder, resume=True, seeds=range(5))
@@ -321,14 +317,11 @@ def test_a_batch_whose_checksums_are_lost_in_their_file_is_carried_out_again(bas
     assert_same(folder, whole)
 
 
-def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(
-    half, whole, tmp_path
-):
-    folder = copy(half, tmp_path)
-    (folder / results.MANIFEST).unlink()
-    flip(folder / results.part_name(8, results.RUNS))
-    assert run(folder, resume=True).repeated == 16
-    assert_same(folder, whole)
+def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(begun, whole):
+    (begun / results.MANIFEST).unlink()
+    flip(begun / results.part_name(8, results.RUNS))
+    assert run(begun, resume=True).repeated == 16
+    assert_same(begun, whole)
 
 
 @pytest.mark.parametrize(
@@ -343,52 +336,48 @@ def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_th
         ("packages", [], "an object"),
     ],
 )
-def test_a_manifest_of_wrong_types_is_one_line(whole, tmp_path, key, value, wanted):
-    folder = copy(whole, tmp_path)
-    (folder / SUMS).unlink()
-    manifest = json.loads((folder / results.MANIFEST).read_text()) | {key: value}
-    (folder / results.MANIFEST).write_text(json.dumps(manifest))
+def test_a_manifest_of_wrong_types_is_one_line(ended, key, value, wanted):
+    (ended / SUMS).unlink()
+    manifest = json.loads((ended / results.MANIFEST).read_text()) | {key: value}
+    (ended / results.MANIFEST).write_text(json.dumps(manifest))
     for command in (results.load_runs, results.collect):
         shown = re.escape(repr(str(value)[:60]))
         with pytest.raises(ConfigurationError, match=f"manifest.json is damaged: {key} must be {wanted}, got {shown};"):
-            command(folder)
+            command(ended)
 
 
-def test_stray_files_are_named_and_count_for_nothing(half, whole, tmp_path):
-    folder = copy(half, tmp_path)
-    part = folder / results.part_name(0, results.RUNS)
+def test_stray_files_are_named_and_count_for_nothing(begun, whole):
+    part = begun / results.part_name(0, results.RUNS)
     for name in ("1x.runs.parquet", "0.runs.parquet", "notes.txt"):
-        shutil.copy(part, folder / results.PARTS / name)
-    assert len(results.load_runs(folder)) == RUNS - 8
-    assert {finding.fault for finding in examine(folder).findings} == {"is no file of a batch"}
-    shutil.copy(part, folder / results.part_name(20, results.RUNS))
-    assert examine(folder).findings[0].fault == "is not listed in SHA256SUMS"
-    assert run(folder, resume=True).repeated == 8
-    assert_same(folder, whole)
+        shutil.copy(part, begun / results.PARTS / name)
+    assert len(results.load_runs(begun)) == RUNS - 8
+    assert {finding.fault for finding in examine(begun).findings} == {"is no file of a batch"}
+    shutil.copy(part, begun / results.part_name(20, results.RUNS))
+    assert examine(begun).findings[0].fault == "is not listed in SHA256SUMS"
+    assert run(begun, resume=True).repeated == 8
+    assert_same(begun, whole)
 
 
-def test_files_that_a_killed_process_had_begun_are_removed(half, whole, tmp_path):
-    folder = copy(half, tmp_path)
-    begun = [folder / f".{results.RUNS}-12-34", folder / results.PARTS / f".00000016.{results.RUNS}-12-34"]
-    for path in begun:
+def test_files_that_a_killed_process_had_begun_are_removed(begun, whole):
+    partial = [begun / f".{results.RUNS}-12-34", begun / results.PARTS / f".00000016.{results.RUNS}-12-34"]
+    for path in partial:
         path.write_bytes(b"half")
-    assert examine(folder).findings == []
+    assert examine(begun).findings == []
 
     class Look(Notes):
         def finished(self, rows) -> None:
-            assert not any(path.exists() for path in begun)
+            assert not any(path.exists() for path in partial)
             super().finished(rows)
 
-    assert run(folder, Look(), resume=True).repeated == 8
-    assert_same(folder, whole)
+    assert run(begun, Look(), resume=True).repeated == 8
+    assert_same(begun, whole)
 
 
-def test_a_line_that_a_killed_process_left_unfinished_is_passed_over(half, whole, tmp_path):
-    folder = copy(half, tmp_path)
-    with (folder / SUMS).open("a") as file:
+def test_a_line_that_a_killed_process_left_unfinished_is_passed_over(begun, whole):
+    with (begun / SUMS).open("a") as file:
         file.write("0123456789abcdef")
-    assert run(folder, resume=True).repeated == 8
-    assert_same(folder, whole)
+    assert run(begun, resume=True).repeated == 8
+    assert_same(begun, whole)
 
 
 def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_path):
@@ -408,21 +397,19 @@ def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_pat
 
 
 @pytest.mark.parametrize("name", [results.RUNS, results.FAILURES, results.MANIFEST])
-def test_a_file_that_is_gone_is_named(whole, tmp_path, name):
-    folder = copy(whole, tmp_path)
-    (folder / name).unlink()
-    found = [(each.name, each.fault) for each in examine(folder).findings]
+def test_a_file_that_is_gone_is_named(ended, name):
+    (ended / name).unlink()
+    found = [(each.name, each.fault) for each in examine(ended).findings]
     assert found == [(name, "is missing")]
 
 
-def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_them(half, tmp_path):
-    folder = copy(half, tmp_path)
-    (folder / SUMS).unlink()
+def test_rows_that_the_part_before_has_too_are_named_where_nothing_vouches_for_them(begun):
+    (begun / SUMS).unlink()
     rows = tables.as_table([made_up_row(f"run{index}") for index in range(6)])
     for index in (8, 12):
-        (folder / results.part_name(index, results.RUNS)).unlink(missing_ok=True)
-        tables.write_table(rows, folder / results.part_name(index, results.RUNS))
-    named = {each.name: each.fault for each in examine(folder).findings}
+        (begun / results.part_name(index, results.RUNS)).unlink(missing_ok=True)
+        tables.write_table(rows, begun / results.part_name(index, results.RUNS))
+    named = {each.name: each.fault for each in examine(begun).findings}
     assert named[results.part_name(12, results.RUNS)] == "holds runs that the part before it has, too"
 
 
@@ -444,10 +431,9 @@ def test_a_changed_bit_is_found_by_the_pages_where_nothing_else_vouches_also_in_
         results.load_runs(folder)
 
 
-def test_a_manifest_of_another_schema_is_not_written_anew(half, tmp_path):
-    folder = copy(half, tmp_path)
-    manifest = json.loads((folder / results.MANIFEST).read_text()) | {"schema_version": "3"}
-    (folder / SUMS).unlink()
-    (folder / results.MANIFEST).write_text(json.dumps(manifest))
+def test_a_manifest_of_another_schema_is_not_written_anew(begun):
+    manifest = json.loads((begun / results.MANIFEST).read_text()) | {"schema_version": "3"}
+    (begun / SUMS).unlink()
+    (begun / results.MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(ConfigurationError, match="has results of schema '3'; this servobench reads '4'; the column"):
-        run(folder, resume=True)
+        run(begun, resume=True)
