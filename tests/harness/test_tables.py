@@ -28,17 +28,10 @@ def runs() -> pd.DataFrame:
     rows = []
     for seed in range(20):
         for name, time in (("quick", 1.0 + 0.01 * seed), ("slow", 2.0 + 0.02 * seed)):
-            lost = name == "slow" and seed == 3
-            rows.append(
-                {
-                    "run_id": f"{name}-{seed}", "plant": "kinematic", "controller": name, "task": "random",
-                    "mismatch": "moderate", "seed": seed, "noise_factor": 1.0, "latency_s": None, "period_s": None,
-                    "status": "feature_lost" if lost else "completed",
-                    "settling_time_s": np.nan if name == "slow" and seed < 4 else time,
-                    "task_kind": "point_to_point", "feature_unit": "m",
-                    "overshoot": 0.1, "rms_error_evaluated": 0.002, "steady_state_error": 0.001 * (1 + seed),
-                }
-            )  # fmt: skip
+            late, lost = name == "slow" and seed < 4, name == "slow" and seed == 3
+            values = {"settling_time_s": np.nan if late else time, "steady_state_error": 0.001 * (1 + seed)}
+            values["status"] = "feature_lost" if lost else "completed"
+            rows.append(made_up_row(f"{name}-{seed}", controller=name, task="random", seed=seed, **values))
     return pd.DataFrame(rows)
 
 
@@ -79,7 +72,6 @@ def test_pairs_are_compared_on_common_seeds(runs):
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     better = runs["controller"] == "quick"
     curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
-    curve["settling_band"] = 0.005
     (row,) = compare_controllers(curve).to_dict("records")
     assert row["mean difference in RMS error of the judged part [mm]"] == "-1.50 [-1.50, -1.50]"
     assert row["verdict"] == "better"
@@ -94,8 +86,8 @@ def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
 
 
 def test_conditions_are_told_apart_in_words(runs):
-    loud = runs.assign(noise_factor=2.0, latency_s=0.15)
-    assert [words for words, _ in split_conditions(pd.concat([runs, loud]))] == [
+    usual, loud = runs.assign(noise_factor=1.0, latency_s=None), runs.assign(noise_factor=2.0, latency_s=0.15)
+    assert [words for words, _ in split_conditions(pd.concat([usual, loud]))] == [
         "random on kinematic, moderate",
         "random on kinematic, moderate, noise × 2, latency 150 ms",
     ]
