@@ -1,17 +1,21 @@
-"""Runs with another robot than the UR5: names, tables, tasks, and what cannot be put together."""
+"""Runs with another robot than the UR5, or of gears that are rippled: names, tables, tasks, and refusals."""
 
 from dataclasses import replace
 
+import casadi
 import numpy as np
 import pytest
 
 from kit.lanes import assert_rows_of_single_runs
+from kit.plants import NEEDS_MUJOCO
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
+from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
+from servobench.harness.run.export import arm_product
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted
@@ -104,3 +108,31 @@ def test_what_counts_on_no_model_keeps_its_values_on_an_arm_that_nobody_knows():
     published, bound = find_controller("ukf_mfac:published"), find_controller("calibrated")
     assert default_config(published, model_known=False).estimator == default_config(published).estimator
     assert default_config(bound, model_known=False) == default_config(bound)
+
+
+def test_bounds_are_given_the_kinematics_of_rippled_gears():
+    request = RunRequest("kinematic", "calibrated", "circle", "moderate+ripple=0.03rad", 3)
+    experiment = build_experiment(request, Settings())
+    experiment.plant.reset(0)
+    truth, start = experiment.plant.truth(), np.asarray(experiment.scenario.start)
+    knowledge = experiment.controller.servo.knowledge
+    np.testing.assert_allclose(knowledge.true_jacobian(start), truth.jacobian, atol=1e-12)
+    q = casadi.MX.sym("q", 6)
+    feature = casadi.Function("h", [q], [knowledge.true_symbolic(q)])
+    np.testing.assert_allclose(feature(start).full().ravel(), truth.feature, atol=1e-12)
+
+
+@NEEDS_MUJOCO
+def test_worlds_without_gears_and_tool_are_refused_in_one_line():
+    mismatch = "moderate+backlash=2deg"
+    with pytest.raises(ConfigurationError, match="mujoco has no mechanics.backlash, .*those of kinematic and fmu"):
+        resolve(RunRequest("mujoco", "regression_mfac", "circle", mismatch, 3), Settings())
+    with pytest.raises(ConfigurationError, match="an arm is exported without backlash: leave it out, and set"):
+        arm_product(RunRequest("kinematic", "regression_mfac", "circle", mismatch, 3), "words")
+
+
+def test_a_run_under_a_turning_camera_is_not_filmed():
+    request = RunRequest("kinematic", "regression_mfac", "circle", "moderate+camera_turn=15deg", 3)
+    result = run_experiment(request, Settings())
+    with pytest.raises(ConfigurationError, match="cannot be shown: films have no camera that turns"):
+        logged_run(result.row, result.steps)
