@@ -292,10 +292,3 @@ def test_controllers_that_share_no_seed_are_no_pair(output_of, tmp_path):
     rows = [made_up_row(f"{name}-{seed}", controller=name, seed=seed) for name, seed in (("a", 0), ("b", 1))]
     write_folder(tmp_path / "folder", rows, [])
     assert "a − b" not in output_of("statistics", tmp_path / "folder")
-
-
-def test_empty_columns_of_numbers_have_the_type_of_numbers():
-    table = tables.as_table([made_up_row(RUN, latency_s=None, period_s=None, noise_factor=1.0, nothing=None)])
-    assert [str(table.schema.field(name).type) for name in ("latency_s", "period_s", "nothing")] == [
-        "double", "double", "null",
-    ]  # fmt: skip

@@ -43,13 +43,6 @@ def resolved(controller, **settings):
     return resolve(request, Settings({controller: settings} if settings else {}))
 
 
-def library():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import control
-    return control
-
-
 @pytest.mark.parametrize(("delay", "latency"), [(0.0, 0.0), (0.05, 0.1), (0.03, 0.07), (0.12, 0.0), (0.0, 0.02)])
 def test_the_arm_is_the_same_at_a_finer_period(delay, latency):
     whole, fine = (ArmModel(JACOBIAN, dt, 0.05, delay, latency).matrices() for dt in (PERIOD, PERIOD / 5))
@@ -110,7 +103,9 @@ def test_an_mfac_controller_is_linearised_as_its_closed_form_says():
 
 
 def test_margins_of_a_single_channel_are_those_of_the_library():
-    control = library()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import control
     arm = ArmModel(np.eye(1), PERIOD, 0.05, 0.05, 0.1)
     controller = StateSpace(np.eye(1), PERIOD * np.eye(1), -0.5 * np.eye(1), np.array([[-2.5]]))
     both = StateSpace(

@@ -215,9 +215,10 @@ def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(f
 
 
 def test_what_is_no_number_is_null_and_a_column_of_it_one_of_numbers():
-    table = tables.as_table([{"some": np.nan, "none": np.nan, "nothing": None}, {"some": 2.0, "none": np.nan}])
-    assert [str(each) for each in table.schema.types] == ["double", "double", "null"]
-    assert [column.null_count for column in table.columns] == [1, 2, 2]
+    rows = [{"some": np.nan, "none": np.nan, "latency_s": None, "nothing": None}, {"some": 2.0, "none": np.nan}]
+    table = tables.as_table(rows)
+    assert [str(each) for each in table.schema.types] == ["double", "double", "double", "null"]
+    assert [column.null_count for column in table.columns] == [1, 2, 2, 2]
 
 
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):

@@ -209,22 +209,23 @@ def test_the_watchdog_ends_the_program_after_its_time_and_a_kick_holds_it_off(sp
     assert lines == ["control program ended by its watchdog, after 0.102 s without a command"]
 
 
-def test_a_program_that_ended_stops_the_arm_within_its_deceleration(spec):
+def moving_program(spec):
     program = program_of(spec, [], lockstep=False)
     program.inputs |= registers(9, *[1.0] * 6, 100.0)
     program.cycle()
     for _ in range(20):
         program.advance()
+    return program
+
+
+def test_a_program_that_ended_stops_the_arm_within_its_deceleration(spec):
+    program = moving_program(spec)
     program.stop("for a test")
     assert np.abs([program.advance() for _ in range(50)][-1]).max() == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_program_that_replaces_one_that_moves_begins_with_a_stop(spec):
-    program = program_of(spec, [], lockstep=False)
-    program.inputs |= registers(9, *[1.0] * 6, 100.0)
-    program.cycle()
-    for _ in range(20):
-        program.advance()
+    program = moving_program(spec)
     program.inputs |= registers(0)
     program.begin()
     program.cycle()

@@ -48,11 +48,15 @@ def commands(table, prefix=""):
     return table.filter(regex=f"^{prefix}{COMMAND}_").to_numpy()
 
 
-def as_file(steps, path):
-    steps[[name for name in steps if name.startswith(("time_s", "reference_", "feature_", "joint_position_"))]].to_csv(
-        path, index=False
-    )
-    return path
+def own_log(steps):
+    """Return the columns that a log of one's own needs."""
+    return steps[[name for name in steps if name.startswith(("time_s", "reference_", "feature_", "joint_position_"))]]
+
+
+def show(table, path, controller="constant"):
+    """Write a log and show it to a controller."""
+    table.to_csv(path, index=False)
+    return shadow(*logged_in_file(path, controller, "ur5", "position"))
 
 
 def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder, steps):
@@ -81,8 +85,8 @@ def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp
 
 
 def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of, output_of, steps, tmp_path):
-    table = as_file(steps, tmp_path / "robot.csv")
-    seen = shadow(*logged_in_file(table, "constant", "ur5", "position"))
+    table = tmp_path / "robot.csv"
+    seen = show(own_log(steps), table)
     assert seen["error_norm"].isna().all()
     assert np.abs(commands(seen)).max() > 0.1
     with pytest.raises(ConfigurationError, match="the log has no commands to compare with"):
@@ -115,18 +119,13 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of
     ],
 )  # fmt: skip
 def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message):
-    path = tmp_path / "robot.csv"
-    change(pd.read_csv(as_file(steps, path))).to_csv(path, index=False)
     with pytest.raises(ConfigurationError, match=message):
-        shadow(*logged_in_file(path, "constant", "ur5", "position"))
+        show(change(own_log(steps)), tmp_path / "robot.csv")
 
 
 def test_a_log_whose_clock_counts_from_1970_is_shown_like_one_that_begins_at_0(steps, tmp_path):
-    path = tmp_path / "robot.csv"
-    table = pd.read_csv(as_file(steps, path))
-    seen = shadow(*logged_in_file(path, "constant", "ur5", "position"))
-    table.assign(time_s=1.76e9 + table["time_s"]).to_csv(path, index=False)
-    late = shadow(*logged_in_file(path, "constant", "ur5", "position"))
+    table = own_log(steps)
+    seen, late = (show(table.assign(time_s=begin + table["time_s"]), tmp_path / "robot.csv") for begin in (0.0, 1.76e9))
     np.testing.assert_allclose(commands(late), commands(seen), rtol=1e-5)
 
 
@@ -154,11 +153,6 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
 @pytest.fixture(scope="module")
 def lap():
     return run("ukf_mfac", task="circle", settings={"circle": {"laps": 1}}).steps
-
-
-def show(table, path, controller="constant"):
-    table.to_csv(path, index=False)
-    return shadow(*logged_in_file(path, controller, "ur5", "position"))
 
 
 @pytest.mark.parametrize("slip", SLIPS)
