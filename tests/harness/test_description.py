@@ -69,10 +69,10 @@ def test_changed_settings_are_kept_and_their_defaults_told(output_of, tmp_path):
 
 def test_a_file_of_settings_serves_commands_that_read_a_part_of_it(output_of, tmp_path):
     path = tmp_path / "bench.toml"
-    output_of("init", path, "--plants", "all", "--controllers", "ukf_mfac,mfac+rls")
-    again = output_of("init", "-", "--plants", "kinematic", "--config", path)
-    assert list(tomllib.loads(again)) == ["run", "kinematic", "ukf_mfac", "exp2"]
-    output_of("fmu", "export", "--controller", "ukf_mfac", "-o", tmp_path / "loop.fmu", "--config", path)
+    output_of("init", path, "--plants", "all", "--controllers", "constant,mfac+rls")
+    again = output_of("init", "-", "--plants", "kinematic", "--controllers", "constant", "--config", path)
+    assert list(tomllib.loads(again)) == ["run", "kinematic", "constant", "exp2"]
+    output_of("fmu", "export", "--controller", "constant", "-o", tmp_path / "loop.fmu", "--config", path)
     assert (tmp_path / "loop.fmu").exists()
 
 

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
+from kit.folders import made_up_row
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import Settings
@@ -55,6 +56,7 @@ def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
 
 
 def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long(monkeypatch, tmp_path):
+    monkeypatch.setattr(robustness, "draw_map", lambda *_: [tmp_path])  # which takes seconds
     monkeypatch.setattr(robustness, "LONGER", ((robustness.DURATION, 0.4),))
     line = Line(MOVE, "camera moved half-way [°]", (Magnitude(0.0, "deg"), Magnitude(90.0, "deg")))
     monkeypatch.setattr(robustness, "KNOWN_LINES", {MOVE: line})
@@ -88,8 +90,7 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
     line = next(line for line in LINES if line.axis == LATENCY)
     runs = pd.DataFrame(
         [
-            {"axis": LATENCY, "controller": name, "magnitude": place.number, "seed": 0, "plant": "kinematic",
-             "settling_time_s": 1.0, "status": "completed", "outcome": "settled"}
+            made_up_row("", controller=name, outcome="settled", axis=LATENCY, magnitude=place.number)
             for name in limits
             for place in line.places
         ]
@@ -117,11 +118,11 @@ def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_rendered_arm
 
 
 def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, monkeypatch):
+    never = [("noise", "rls", 4.0), ("noise", "rls", 8.0)]
     runs = pd.DataFrame(
         [
-            {"axis": line.axis, "controller": name, "magnitude": place.number, "seed": seed, "plant": "kinematic",
-             "status": "completed", "task_kind": "point_to_point", "settling_band": 0.005, "feature_unit": "m",
-             "settling_time_s": math.nan if (line.axis, name) == ("noise", "rls") and place.number > 2 else 1.0 + seed}
+            made_up_row("", controller=name, seed=seed, axis=line.axis, magnitude=place.number,
+                        settling_time_s=math.nan if (line.axis, name, place.number) in never else 1.0 + seed)
             for line in LINES if line.axis in ("links", "noise", "tool")
             for name in ("ukf_mfac", "ukf_mpc", "rls")
             for place in line.places
