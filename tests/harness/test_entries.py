@@ -174,11 +174,11 @@ def test_a_broken_file_is_one_line_with_its_place(tmp_path, what):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["syntax", "exception in the constructor"])
+@pytest.mark.parametrize("what", ["syntax", "exception in the constructor", "an entry that builds something else"])
 def test_a_command_refuses_a_broken_file_with_this_line_and_exit_code_2(refusal_of, tmp_path, what):
     text, message = BROKEN[what]
     write(tmp_path, text)
-    assert refusal_of("run", "--plant", "kinematic", "./mine.py").startswith(f"servobench: {message}")
+    assert refusal_of("run", "--plant", "kinematic", "--controller", "./mine.py").startswith(f"servobench: {message}")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
 
 
