@@ -15,15 +15,6 @@ from servobench.plant.contract.faults import ConfigurationError
 SHORT = {"exp1": {"duration": 0.5}}
 
 
-@pytest.mark.slow
-def test_a_controller_class_is_compared_with_a_named_one():
-    table = servobench.compare([Resting, "ukf_mfac"], seeds=2, settings=SHORT, workers=2)
-    assert table["controller"].tolist() == ["Resting", "Resting", "ukf_mfac", "ukf_mfac"]
-    assert (table["status"] == "completed").all(), table["reason"].tolist()
-    effort = table.groupby("controller")["control_effort_rad"].max()
-    assert effort["Resting"] == 0.0 < effort["ukf_mfac"]
-
-
 def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
     class Local(Resting):
         """As Resting."""

@@ -89,7 +89,7 @@ HOSTILE = {
 }
 ACCEPTED = ("words", "code")
 COMMANDS = (
-    "statistics {}", "figures {}", "report {}", "verify {}",
+    "statistics {}", "figures {} --format svg", "report {}", "verify {}",
     "export {} --out out/csv", "export {} --out out/mcap --format mcap",
     f"shadow {{}} --run {RUN} --controller constant --out out/seen.csv", f"record {{}} --run {RUN} --kinds snapshots",
     "compare --controllers constant --plants kinematic --tasks exp1 --workers 1 --resume --out {}", "collect {}",

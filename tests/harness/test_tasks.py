@@ -13,6 +13,7 @@ from kit.command import judged
 from kit.command import servobench as command
 from kit.documents import blocks
 from kit.own import CELL, WHOLE, install, write
+from kit.resting import Resting
 from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
@@ -37,15 +38,16 @@ def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path
 def test_worker_processes_carry_out_the_same_runs_of_users_code_and_the_manifest_names_it(tmp_path):
     for name, text in {"a/cell.py": CELL, "b/mine.py": WHOLE, "c/spiral.py": SPIRAL}.items():
         write(tmp_path, text, name)
-    asked = ["b/mine.py", "constant"], ["a/cell.py", "kinematic"], ["c/spiral.py", "exp1"]
+    asked = ["b/mine.py", Resting], ["a/cell.py", "kinematic"], ["c/spiral.py", "exp1"]
     settings = {"exp1": {"duration": 0.5}, "Spiral": {"duration": 0.5}}
     tables = [servobench.compare(*asked, seeds=2, settings=settings, workers=n, out=str(n)) for n in (1, 2)]
     pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
     assert set(tables[0]["status"]) == {"completed"}
+    assert (tables[0]["control_effort_rad"] == 0.0).all()
     manifest = json.loads((tmp_path / "2" / "manifest.json").read_text())
     own = {name: record["place"] for kind in ("controllers", "plants", "tasks")
            for name, record in manifest[f"own_{kind}"].items()}  # fmt: skip
-    assert own == {"Mine": "b/mine.py", "Cell": "a/cell.py", "Spiral": "c/spiral.py"}
+    assert own == {"Mine": "b/mine.py", "Resting": "Resting", "Cell": "a/cell.py", "Spiral": "c/spiral.py"}
     assert "c/spiral.py" in " ".join(manifest["files"])
 
 
