@@ -1,6 +1,7 @@
 """`import servobench` as a user's script sees it."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -36,41 +37,32 @@ def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
         servobench.compare([Resting], seeds=())
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"task": None}, "task must be a name, got None"),
-        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
-        ({"robot": 3}, "robot must be a name, got 3"),
-        ({"sensing": None}, "sensing must be a name, got None"),
-        ({"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
-        ({"seed": True}, "seed must be a non-negative integer, got True"),
-        ({"settings": [1]}, "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]"),
-        ({"settings": {"kinematic": 3}}, "settings must be sections with keys"),
-    ],
-    ids=str,
-)
-def test_an_argument_of_the_wrong_type_is_refused_in_a_line(given, words):
-    with pytest.raises(ConfigurationError, match=re.escape(words)):
-        servobench.run("constant", **given)
+RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, controllers=["constant"])
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("call", "given", "words"),
     [
-        ({"controllers": "constant"}, "controllers must be a list, such as ['constant'], got 'constant'"),
-        ({"tasks": None}, "tasks must be a list"),
-        ({"seeds": "3"}, "seeds must be a number of seeds or a list of them, got '3'"),
-        ({"workers": 0}, "workers must be a number above 0, got 0"),
-        ({"run_timeout": -1}, "run_timeout must be a number above 0, got -1"),
-        ({"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
-        ({"resume": True}, "resume needs out, the folder to continue in"),
+        (RUN, {"task": None}, "task must be a name, got None"),
+        (RUN, {"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
+        (RUN, {"robot": 3}, "robot must be a name, got 3"),
+        (RUN, {"sensing": None}, "sensing must be a name, got None"),
+        (RUN, {"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
+        (RUN, {"seed": True}, "seed must be a non-negative integer, got True"),
+        (RUN, {"settings": [1]}, "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]"),
+        (RUN, {"settings": {"kinematic": 3}}, "settings must be sections with keys"),
+        (COMPARE, {"controllers": "constant"}, "controllers must be a list, such as ['constant'], got 'constant'"),
+        (COMPARE, {"tasks": None}, "tasks must be a list"),
+        (COMPARE, {"seeds": "3"}, "seeds must be a number of seeds or a list of them, got '3'"),
+        (COMPARE, {"workers": 0}, "workers must be a number above 0, got 0"),
+        (COMPARE, {"run_timeout": -1}, "run_timeout must be a number above 0, got -1"),
+        (COMPARE, {"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
+        (COMPARE, {"resume": True}, "resume needs out, the folder to continue in"),
     ],
-    ids=str,
 )
-def test_a_comparison_with_an_argument_of_the_wrong_type_is_refused_in_a_line(given, words):
+def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):
     with pytest.raises(ConfigurationError, match=re.escape(words)):
-        servobench.compare(**({"controllers": ["constant"]} | given))
+        call(**given)
 
 
 def test_a_seed_of_numpy_is_that_seed():
