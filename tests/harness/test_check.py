@@ -9,7 +9,6 @@ import pytest
 import servobench
 from kit.broken_controllers import BROKEN, NOTED
 from kit.command import python
-from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.check.controllers import check_controller
 from servobench.plant.bench.plant import PlantEntry
@@ -207,17 +206,10 @@ def test_new_files_pass_their_own_tests(output_of, tmp_path):
         ("plant", "my_cell", "check plant", ()),
     ):
         assert f"servobench {check} ./laws/{name}.py" in output_of("new", kind, name, "--folder", "laws", *options)
+    checks = [line.split()[:2] for line in output_of("check", "./laws/my_aided_law.py").splitlines()]
+    assert ["ok", "aids"] in checks
     done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", path=tmp_path / "laws")
     assert "6 passed" in done.stdout, done.stdout + done.stderr
-
-
-def test_a_new_controller_with_aids_says_so_and_a_plant_has_none(refusal_of, output_of, monkeypatch, tmp_path):
-    assert command(monkeypatch, "new", "controller", "my_law", "--aids") == 0
-    lines = [line.split(maxsplit=2) for line in output_of("check", "./my_law.py").splitlines()]
-    assert ["ok", "aids"] in lines
-    line = refusal_of("new", "plant", "my_cell", "--aids")
-    assert "--aids are those of a controller; leave the option out for a plant" in line
-    assert not (tmp_path / "my_cell.py").exists()
 
 
 @pytest.mark.parametrize("name", ["3d", "class", "my-law", "../mine", "test_mine", ""])

@@ -149,10 +149,6 @@ def test_a_folder_of_another_schema_is_refused(folder):
         results.load_runs(folder)
 
 
-def without_steps(folder: Path) -> None:
-    sweep(folder)
-
-
 def without_file(name: str) -> Callable[[Path], None]:
     return lambda folder: (comparison(folder, controllers=("constant",), tasks=("exp1",)) / name).unlink()
 
@@ -166,10 +162,10 @@ def of_schema_3(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "command", "words"),
     [
-        (without_steps, "shadow DIR --controller constant", "DIR holds no steps: a sweep keeps none; use run or c"),
-        (without_steps, "record DIR", "DIR holds no steps: a sweep keeps none"),
-        (without_steps, "export DIR --out new", "DIR holds no steps: a sweep keeps none"),
-        (without_steps, "figures DIR --kind errors", "DIR holds no steps: a sweep keeps none"),
+        (sweep, "shadow DIR --controller constant", "DIR holds no steps: a sweep keeps none; use run or c"),
+        (sweep, "record DIR", "DIR holds no steps: a sweep keeps none"),
+        (sweep, "export DIR --out new", "DIR holds no steps: a sweep keeps none"),
+        (sweep, "figures DIR --kind errors", "DIR holds no steps: a sweep keeps none"),
         (without_file(results.STEPS), "export DIR --out new", "DIR/steps.parquet is missing; repeat the command"),
         (without_file(results.STEPS), "figures DIR", "DIR/steps.parquet is missing; repeat the command"),
         (without_file(results.RUNS), "statistics DIR", "DIR/runs.parquet is missing; repeat the command"),

@@ -13,6 +13,7 @@ from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures.replay import logged_run
+from servobench.harness.run import resolution as resolved
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.export import arm_product
@@ -20,6 +21,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.kinematic import ENTRY
 from servobench.plant.robot.catalogue import find_robot
 
 PANDA = RunRequest("kinematic", "regression_mfac", "exp2", "moderate", 3, robot="panda")
@@ -81,9 +83,6 @@ def test_the_manifest_says_which_arm_it_was(tmp_path):
 
 
 def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
-    from servobench.harness.run import resolution as resolved
-    from servobench.plant.kinematic import ENTRY
-
     monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
     with pytest.raises(ConfigurationError, match="brings a robot of its own, so --robot panda does not apply"):
         resolve(PANDA, Settings())

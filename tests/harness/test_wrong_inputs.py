@@ -82,6 +82,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("statistics", "results", "--json", "--markdown"), "are ways to print the same; give one of them"),
     (("statistics", "results", "--latex", "--markdown"), "are ways to print the same; give one of them"),
     (("serve", "--address", "robot"), "--address: 'robot' does not appear to be an IPv4 or IPv6 address"),
+    (("new", "plant", "my_cell", "--aids"), "--aids are those of a controller; leave the option out for a plant"),
     (("new", "controller", "taken"), "test_taken.py exists already and is left as it is"),
     (("init", "file"), "file exists already and is left as it is; name another file"),
     (("init", "none/bench.toml"), "none/bench.toml cannot be written: No such file or directory"),
