@@ -248,7 +248,7 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     for key, group in runs.groupby(known, sort=False, dropna=False):
         values: dict[str, Any] = dict(zip(known, key, strict=True))
         words = f"{values['task']} on {place_name(values['plant'], values.get('sensing'))}, {values['mismatch']}"
-        if values.get("noise_factor", 1.0) != 1.0:
+        if abs(values.get("noise_factor", 1.0) - 1.0) > 0.0:  # NaN: a row of a table without this column
             words += f", noise × {values['noise_factor']:g}"
         for name, (heading, factor) in varied.items():
             if name != "noise_factor" and not pd.isna(values[name]):

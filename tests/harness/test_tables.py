@@ -87,8 +87,10 @@ def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
 
 def test_conditions_are_told_apart_in_words(runs):
     usual, loud = runs.assign(noise_factor=1.0, latency_s=None), runs.assign(noise_factor=2.0, latency_s=0.15)
-    assert [words for words, _ in split_conditions(pd.concat([usual, loud]))] == [
+    older = runs.assign(mismatch="none")  # without the columns of both
+    assert [words for words, _ in split_conditions(pd.concat([usual, older, loud]))] == [
         "random on kinematic, moderate",
+        "random on kinematic, none",
         "random on kinematic, moderate, noise × 2, latency 150 ms",
     ]
 
