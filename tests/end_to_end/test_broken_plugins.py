@@ -142,14 +142,14 @@ for arguments in json.loads(sys.argv[1]):
             told.append((stop.code or 0, out.getvalue(), err.getvalue()))
 print(json.dumps(told))
 """
-SHORT = ("--set", "exp1.duration=0.3", "--task", "exp1")
+SHORT = ("--set", "exp1.duration=0.3", "--task", "exp1", "--no-figures")
 NAMED = [*CONTROLLERS, "whole", "ukf_mfac", "import-ends", "import-hangs"]
 RUNS = {name: ["run", name, "--plant", "kinematic", *SHORT] for name in NAMED}
 COMMANDS = {
     "controllers": ["controllers", "--json"],
     "plants": ["plants", "--json"],
     "compare": ["compare", "--controllers", "all", "--plants", "kinematic,cell", "--tasks", "exp1", "--out", "out",
-                "--set", "exp1.duration=0.3", "--no-report", "--workers", "1"],
+                "--set", "exp1.duration=0.3", "--no-figures", "--no-report", "--workers", "1"],
     **RUNS,
     "run crashing": ["run", "constant", "--plant", "crashing", *SHORT],
     "run cell": ["run", "constant", "--plant", "cell", *SHORT],

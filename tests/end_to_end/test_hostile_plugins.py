@@ -62,9 +62,9 @@ REASONS = {
 }
 LINES = {"build": 2, "close": 2, "hang": 1}  # of the trace of a run that name the plug-in
 COMMANDS = {
-    "compare": ("--no-report", "--tasks", "random", "--seeds", "4", "--set", "random.duration=1"),
+    "compare": ("--no-figures", "--no-report", "--tasks", "random", "--seeds", "4", "--set", "random.duration=1"),
     "sweep": ("--seeds", "4", "--set", "random.duration=1"),
-    "tune": ("--robots", "2", "--studies", "1", "--trials", "1", "--search", "0"),
+    "tune": ("--robots", "1", "--studies", "1", "--trials", "1", "--search", "0"),
 }
 
 

@@ -103,8 +103,8 @@ def test_the_undisturbed_run_is_that_of_a_quiet_sweep(swept, tmp_path, monkeypat
 
 def test_a_single_run_ends_with_its_row(tmp_path):
     out = tmp_path / "out"
-    single = ("run", places("Segfaults"), "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(out))
-    code, output = finish(start(*single))
+    single = ("run", places("Segfaults"), "--plant", "kinematic", "--no-figures", "--set", "exp2.duration=0.5")
+    code, output = finish(start(*single, "--out", str(out)))
     assert code == 1, output
     assert "1 of 1 run failed" in output
     assert results.load_runs(out)["status"].tolist() == ["crashed"]

@@ -24,7 +24,7 @@ def compared(tmp_path_factory):
     out = tmp_path_factory.mktemp("compared") / "out"
     with pytest.MonkeyPatch.context() as patch:
         arguments = ["--plants", "kinematic", "--controllers", "constant,calibrated", "--tasks", "exp2,circle"]
-        quick = ["--set", "exp2.duration=2", "--set", "circle.laps=1", "--workers", "1"]
+        quick = ["--set", "exp2.duration=2", "--set", "circle.laps=1", "--workers", "1", "--no-figures"]
         assert servobench(patch, "compare", *arguments, *quick, "--out", str(out)) == 0
     return out
 
@@ -85,7 +85,7 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
 def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS))
-    run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1"]
+    run = ["run", "--plant", "kinematic", "--controller", "constant", "--no-figures", "--set", "exp2.duration=1"]
     *_, last = output_of(*run, "--report", "--out", tmp_path / "a").strip().splitlines()
     assert last.startswith(f"report: {tmp_path / 'a'}")
     assert "report:" not in output_of(*run, "--out", tmp_path / "b")
@@ -97,7 +97,17 @@ def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(output_of, mon
         raise ConfigurationError(f"report on {folder}: out of luck")
 
     monkeypatch.setattr(report, "write_report", fail)
-    run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1", "--report"]
+    run = [
+        "run",
+        "--plant",
+        "kinematic",
+        "--controller",
+        "constant",
+        "--no-figures",
+        "--set",
+        "exp2.duration=0.5",
+        "--report",
+    ]
     assert "no report: report on" in output_of(*run, "--out", tmp_path / "out")
     assert len(results.load_runs(tmp_path / "out")) == 1
 
