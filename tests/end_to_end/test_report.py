@@ -9,12 +9,13 @@ import pytest
 
 from kit.browser import browser_page, find_browser
 from kit.command import servobench
-from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
+from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.batch import results
 from servobench.harness.pictures import report
 from servobench.plant.contract.checksums import write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 
+RUN = ("run", "constant", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--no-figures")
 needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
 
@@ -45,7 +46,11 @@ def test_the_notebook_is_committed_without_outputs():
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in notebook_cells())
 
 
-@pytest.mark.parametrize("folder", [comparison, sweep, failed_only])
+def small_comparison(folder: Path) -> Path:
+    return comparison(folder, CONTROLLERS[:2], ("exp1", "circle"))
+
+
+@pytest.mark.parametrize("folder", [small_comparison, sweep, failed_only])
 def test_the_notebook_runs_on_every_kind_of_folder(monkeypatch, capsys, tmp_path, folder):
     monkeypatch.setenv("SERVOBENCH_RESULTS", str(folder(tmp_path / "out")))
     names: dict[str, object] = {"__name__": "notebook"}
@@ -85,10 +90,9 @@ def test_a_folder_of_many_runs_stays_small_and_shows_what_went_wrong_first(tmp_p
 def test_the_path_of_the_report_is_told_at_the_end(output_of, monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS))
-    run = ["run", "--plant", "kinematic", "--controller", "constant", "--no-figures", "--set", "exp2.duration=1"]
-    *_, last = output_of(*run, "--report", "--out", tmp_path / "a").strip().splitlines()
+    *_, last = output_of(*RUN, "--report", "--out", tmp_path / "a").strip().splitlines()
     assert last.startswith(f"report: {tmp_path / 'a'}")
-    assert "report:" not in output_of(*run, "--out", tmp_path / "b")
+    assert "report:" not in output_of(*RUN, "--out", tmp_path / "b")
     assert made == [tmp_path / "a"]
 
 
@@ -97,18 +101,7 @@ def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(output_of, mon
         raise ConfigurationError(f"report on {folder}: out of luck")
 
     monkeypatch.setattr(report, "write_report", fail)
-    run = [
-        "run",
-        "--plant",
-        "kinematic",
-        "--controller",
-        "constant",
-        "--no-figures",
-        "--set",
-        "exp2.duration=0.5",
-        "--report",
-    ]
-    assert "no report: report on" in output_of(*run, "--out", tmp_path / "out")
+    assert "no report: report on" in output_of(*RUN, "--report", "--out", tmp_path / "out")
     assert len(results.load_runs(tmp_path / "out")) == 1
 
 

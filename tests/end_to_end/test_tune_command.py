@@ -8,9 +8,16 @@ import pytest
 from kit.command import finish, servobench, start, wait_for
 from kit.tuning import read_tuned
 from servobench.harness.studies.tuning import campaign as tuning_check
+from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 
 SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]
+
+
+@pytest.fixture(autouse=True)
+def _short_runs(monkeypatch):
+    short = {"random": {"duration": 0.5}, "circle": {"lap_time": 1.0}, "lemniscate": {"lap_time": 1.0}}
+    monkeypatch.setattr(objective, "TASKS", {name: task | short[name] for name, task in objective.TASKS.items()})
 
 
 def test_code_of_users_has_no_search_space_and_is_not_imported(refusal_of, tmp_path):
@@ -34,17 +41,13 @@ def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(output_of
     assert sorted(path.name for path in out.iterdir()) == ["rls.jsonl", "rls.second.jsonl", "rls.toml"]
 
 
-@pytest.mark.parametrize("tolerance", [10.0, -10.0])
-def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whether(
-    monkeypatch, capsys, tmp_path, tolerance
-):
-    monkeypatch.setattr(tuning_check, "TOLERANCE", tolerance)
+def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whether(output_of, monkeypatch, tmp_path):
     check = ("tune", "--check", "--controllers", "constant", "--robots", "2", "--workers", "1")
-    code = servobench(monkeypatch, *check, "--out", str(tmp_path / "out"))
-    output = capsys.readouterr().out
-    assert code == (0 if tolerance > 0.0 else 1)
-    assert ("no change improves a score" in output) == (tolerance > 0.0)
-    assert ("law.damping" in output) == (tolerance < 0.0)
+    for tolerance in (10.0, -10.0):
+        monkeypatch.setattr(tuning_check, "TOLERANCE", tolerance)
+        output = output_of(*check, "--out", tmp_path / "out", code=0 if tolerance > 0.0 else 1)
+        assert ("no change improves a score" in output) == (tolerance > 0.0)
+        assert ("law.damping" in output) == (tolerance < 0.0)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["constant.second.jsonl"]
 
 
