@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import sys
 
@@ -84,6 +85,7 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "report results": ("results", HIDDEN, "path 'results' is not readable"),
     "collect results": ("results", LOCKED, "results folder results cannot be written: Permission denied"),
 }  # fmt: skip
+TRAINING = re.compile("^training networks once, .*\n", re.MULTILINE)  # of claims, where it takes long: when busy
 SCRIPT = """
 import contextlib, io, json, os, sys
 from servobench.harness.cli.main import main
@@ -107,7 +109,7 @@ print(json.dumps(told))
 def told(tmp_path_factory):
     """What each call says, carried out by a user who may not read and write everywhere."""
     folder = tmp_path_factory.mktemp("permissions")
-    comparison(folder / "results")
+    comparison(folder / "results", ("constant",), ("exp1",))
     (folder / "locked").mkdir()
     for name in ("bench.toml", "law.py", "arm.toml", "arm.fmu", "way.csv"):
         (folder / name).write_text("")
@@ -127,6 +129,7 @@ def told(tmp_path_factory):
 def test_what_may_not_be_read_or_written_is_one_right_line(told, call):
     code, error, unchanged = told[call]
     assert code == 2, error
+    error = TRAINING.sub("", error)
     assert error.startswith("servobench: ")
     assert error.count("\n") == 1
     assert CASES[call][2] in error
