@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from PIL import Image
 import generated_tables
 import renewal
 import stored_tables
-from kit.command import carried_out
+from kit.command import carried_out, servobench
 from kit.documents import ROOT
 from kit.documents import tables as page_tables
 from kit.own import write
@@ -27,7 +28,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.studies import robustness
 
-TRIED = ("--set", "random.duration=0.5")
+TRIED = ("--set", "random.duration=0.5", "--workers", "1")
 
 
 def settled_counts(folder: Path) -> dict[str, pd.DataFrame]:
@@ -47,7 +48,12 @@ MOVES = Study(
 
 @pytest.fixture
 def toy(monkeypatch, tmp_path):
-    """A study of few runs, and a folder that stands for docs."""
+    """A study of few runs, whose command is carried out in this process, and a folder that stands for docs."""
+
+    def run_here(words, **_):
+        return SimpleNamespace(returncode=servobench(monkeypatch, *words[3:]))
+
+    monkeypatch.setattr(renewal, "subprocess", SimpleNamespace(run=run_here))
     monkeypatch.setattr(renewal, "STUDIES", {"toy": MOVES})
     monkeypatch.setattr(stored_tables, "FOLDER", tmp_path / "docs" / "tables")
     return tmp_path
@@ -222,7 +228,7 @@ def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path
 def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
     short = (
         "compare", "--plants", "kinematic", "--controllers", "calibrated", "--tasks", "exp2,circle", "--mismatch",
-        "none", "--seeds", "0:1", "--no-report", "--workers", "1",
+        "none", "--seeds", "0:1", "--no-figures", "--no-report", "--workers", "1",
     )  # fmt: skip
     folder = renewal.carry_out(replace(README, commands={"batch": short}), tmp_path, None, [], keep=False)
     for name, content in pictures.readme_pictures(folder).items():
