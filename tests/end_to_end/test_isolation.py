@@ -110,28 +110,18 @@ def test_a_single_run_ends_with_its_row(tmp_path):
     assert results.load_runs(out)["status"].tolist() == ["crashed"]
 
 
-def test_a_batch_that_is_resumed_goes_past_a_run_that_hangs(tmp_path):
+def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(tmp_path):
     out, mark = tmp_path / "out", "resumed"
-    names = places("Quiet", "Hangs")
+    names = places("Quiet", "HangsWithChildren")
     arguments = ("sweep", "--controllers", names, "--workers", "1", *SHORT, "--run-timeout", "3", "--out", str(out))
     process = start(*arguments, **{MARK: mark})
-    wait_for(lambda: part_count(out) > 0)
+    wait_for(lambda: part_count(out) > 0 and any("time.sleep(300)" in line for line in left_behind(MARK, mark)))
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     assert_nothing_stays(mark)
     code, output = finish(start(*arguments, "--resume"))
     assert code == 0, output
     assert results.load_runs(out)["status"].tolist() == ["completed", "timed_out"]
-
-
-def test_nothing_outlives_a_command_that_is_killed(tmp_path):
-    out, mark = tmp_path / "out", "orphans"
-    hanging = ("--controllers", places("HangsWithChildren", "Hangs"), "--workers", "2", *SHORT, "--out", str(out))
-    process = start("sweep", *hanging, **{MARK: mark})
-    wait_for(lambda: any("time.sleep(300)" in line for line in left_behind(MARK, mark)))
-    os.kill(process.pid, signal.SIGKILL)
-    finish(process)
-    assert_nothing_stays(mark)
 
 
 def test_ctrl_c_ends_a_comparison_at_once(tmp_path):
