@@ -240,6 +240,7 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         parse_platforms("amiga")
     with pytest.raises(ValueError, match="fmi_version must be one of 2, 3, got 4"):
         Ur5FmuConfig(fmi_version=4)
+    monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
     monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[cross\]'"):

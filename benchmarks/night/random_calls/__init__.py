@@ -17,7 +17,7 @@ from servobench.fmus.product import Product
 HERE = Path(__file__).parent
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 TIMEOUT = 3600.0  # [s] of a process: a call that does not return is found
-COMMON = ("-std=c11", "-O1", "-g", "-ffp-contract=off", "-Wall", "-Wextra")
+COMMON = ("-std=c11", "-O0", "-g", "-ffp-contract=off", "-Wall", "-Wextra")
 
 
 @cache
