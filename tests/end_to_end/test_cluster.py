@@ -18,26 +18,27 @@ from servobench.plant.contract.faults import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
-SWEEP = ("sweep", "--controllers", "broyden,rls", "--seeds", "300", "--set", "random.duration=4")
-RUNS = 600  # six blocks: the first is there long before the last
+SEEDS = ("--seeds", "30", "--set", "random.duration=3")
+RUNS = 120  # the first block is there long before the last
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
+@pytest.fixture
+def cluster(tmp_path):
     """The address of a scheduler and its two workers."""
-    tmp_path, started = tmp_path_factory.mktemp("cluster"), []
+    folder, started = tmp_path / "cluster", []
+    folder.mkdir()
 
     def launch(name, *arguments):
-        with (tmp_path / f"{name}.log").open("wb") as log:
+        with (folder / f"{name}.log").open("wb") as log:
             started.append(
                 subprocess.Popen(
                     [sys.executable, "-m", "dask", *arguments], stdout=log, stderr=log, start_new_session=True,
-                    env={**os.environ, "PYTHONPATH": str(PACKAGE)}, cwd=tmp_path,
+                    env={**os.environ, "PYTHONPATH": str(PACKAGE)}, cwd=folder,
                 )
             )  # fmt: skip
 
     def address():
-        return re.search(r"Scheduler at:\s+(tcp://127.0.0.1:\d+)", (tmp_path / "scheduler.log").read_text())
+        return re.search(r"Scheduler at:\s+(tcp://127.0.0.1:\d+)", (folder / "scheduler.log").read_text())
 
     try:
         launch("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0")
@@ -52,27 +53,13 @@ def cluster(tmp_path_factory):
             process.wait()
 
 
-def test_a_cluster_carries_out_a_controller_and_a_plant_from_files(cluster, tmp_path):
-    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
-    named = f"--plants {cell}:Cell --controllers {mine},constant --tasks exp1 --seeds 2 --no-report"
-    asked = ["compare", *named.split(), "--set", "exp1.duration=1", "--set", "Mine.gain=3", "--set", "Cell.speed=0.5"]
-    places = {"local": ("--workers", "1"), "remote": ("--scheduler", cluster[0])}
-    started = [start(*asked, "--out", str(tmp_path / name), *where) for name, where in places.items()]
-    for process in started:
-        code, output = finish(process)
-        assert code == 0, output
-    tables = [judged(results.load_runs(tmp_path / name)) for name in places]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
-    assert len(tables[0]) == 4
-    assert set(tables[0]["plant"]) == {"Cell"}
-    assert set(tables[0]["controller"]) == {"Mine", "constant"}
-    assert not set(tables[0]["outcome"]) & {"crashed"}, tables[1]["reason"].tolist()
-
-
-def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
+def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
     scheduler, workers = cluster
-    local = start(*SWEEP, "--out", str(tmp_path / "local"), "--workers", "1")
-    remote = start(*SWEEP, "--out", str(tmp_path / "remote"), "--scheduler", scheduler)
+    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
+    named = ("--plants", f"{cell}:Cell,kinematic", "--controllers", f"{mine},broyden")
+    asked = ("sweep", *named, *SEEDS, "--set", "Mine.gain=3", "--set", "Cell.speed=0.5", "--out")
+    local = start(*asked, str(tmp_path / "local"), "--workers", "1")
+    remote = start(*asked, str(tmp_path / "remote"), "--scheduler", scheduler)
     wait_for(lambda: part_count(tmp_path / "remote") > 0)
     os.killpg(workers[0].pid, signal.SIGKILL)
     finished_before = len(results.load_runs(tmp_path / "remote"))
@@ -82,6 +69,10 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
     assert 0 < finished_before < RUNS
     tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert len(tables[0]) == RUNS
+    assert set(tables[0]["plant"]) == {"Cell", "kinematic"}
+    assert set(tables[0]["controller"]) == {"Mine", "broyden"}
+    assert not set(tables[0]["outcome"]) & {"crashed"}, tables[0]["reason"].tolist()
 
 
 @pytest.mark.parametrize(
