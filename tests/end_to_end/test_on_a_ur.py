@@ -16,14 +16,13 @@ import pytest
 import servobench
 from kit.command import PACKAGE, start
 from kit.documents import ROOT
-from kit.served import fresh_address
+from kit.served import fresh_address, served, waited_for
 from servobench.plant.robot.camera import CAMERA
 
 pytestmark = pytest.mark.skipif(find_spec("rtde_control") is None, reason="ur-rtde has no wheel for this Python")
 EXAMPLE = ROOT / "docs" / "examples" / "on_a_ur.py"
 WIDE = ("--set", "UR.speed=1.0", "--set", "UR.box=[-2.0,-2.0,-2.0,2.0,2.0,2.0]", "--set", "UR.patience=60.0")
 SIGNALS = ("time_s", "reference_", "feature_", "joint_")
-SHORT = {"target": {"duration": 1.0}}
 
 
 def wait_for(process, words):
@@ -74,11 +73,10 @@ def numbers(steps):
 
 @pytest.mark.slow
 def test_in_lockstep_rows_and_commands_are_those_of_a_run(tmp_path):
-    short = ("--set", "target.duration=2.0")
-    with double("--lockstep", *short) as (_, address):
-        code, said = finished(on_a_ur(address, tmp_path / "served", *WIDE, *short))
-    assert code == 0, said
     settings = {"target": {"duration": 2.0}}
+    with served(settings=settings) as (_, address, _):
+        code, said = finished(on_a_ur(address, tmp_path / "served", *WIDE, "--set", "target.duration=2.0"))
+    assert code == 0, said
     run = servobench.run("ukf_mfac", task="target", robot="ur5e", settings=settings)
     rows = numbers(servobench.load(tmp_path / "served").steps)
     assert rows.shape == (40, 20)
@@ -87,7 +85,7 @@ def test_in_lockstep_rows_and_commands_are_those_of_a_run(tmp_path):
 
 @pytest.mark.slow
 def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
-    with double() as (_, address):
+    with served(lockstep=False) as (_, address, _):
         patient = ("--set", "UR.patience=20.0", "--set", "target.duration=1.0")
         code, said = finished(on_a_ur(address, tmp_path / "dry", "--dry-run", *patient))
     assert code == 0, said
@@ -98,8 +96,9 @@ def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
-    with double() as (process, address):
-        run = on_a_ur(address, tmp_path / "lost", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
+    long = ("--set", "target.duration=60.0")
+    with double(*long) as (process, address):
+        run = on_a_ur(address, tmp_path / "lost", "--set", "UR.patience=6.0", *long)
         wait_for(process, "control program of")
         process.send_signal(stop)
         began = time.monotonic()
@@ -116,15 +115,13 @@ def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
 
 @pytest.mark.slow
 def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
-    with double("--set", "target.duration=60.0") as (process, address):
+    with served(settings={"target": {"duration": 60.0}}, lockstep=False) as (_, address, lines):
         run = on_a_ur(address, tmp_path / "killed", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
-        wait_for(process, "control program of")
+        assert waited_for(lambda: "control program of" in lines[-1], 60.0)
+        time.sleep(1.0)
         run.kill()
         run.communicate()
-        time.sleep(1.0)
-        process.terminate()
-        said, _ = process.communicate(timeout=20)
-    assert "control program ended by its watchdog" in said
+        assert waited_for(lambda: "control program ended by its watchdog" in lines[-1])
 
 
 CALLS = """
