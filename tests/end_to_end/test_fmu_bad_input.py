@@ -23,12 +23,12 @@ def temporary(tmp_path, monkeypatch):
     assert list(folder.iterdir()) == []
 
 
-def run(monkeypatch, tmp_path: Path, version: int, more: str = "") -> tuple[int, Path]:
+def run(monkeypatch, tmp_path: Path, version: int, *options: str, more: str = "") -> tuple[int, Path]:
     (tmp_path / "crane.toml").write_text(mapping(version) + more)
     out = tmp_path / "out"
     task = ["--task", "target", "--set", "target.target=[0.2,0.7]", "--set", "target.duration=1"]
     start = ["--controller", "broyden", "--set", "broyden.initial.source=probe", "--mismatch", "none"]
-    arguments = ["run", "--plant", f"fmu:{tmp_path / 'crane.toml'}", *start, *task, "--out", str(out)]
+    arguments = ["run", "--plant", f"fmu:{tmp_path / 'crane.toml'}", *start, *task, "--out", str(out), *options]
     return servobench(monkeypatch, *arguments), out
 
 
@@ -56,7 +56,7 @@ ARCHIVES = {
 def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monkeypatch, tmp_path, temporary, capsys):
     build, message = ARCHIVES[case]
     build(tmp_path / "crane.fmu")
-    code, out = run(monkeypatch, tmp_path, 2)
+    code, out = run(monkeypatch, tmp_path, 2, "--no-isolate")
     assert not out.exists()
     assert code == 2
     lines = capsys.readouterr().err.splitlines()
@@ -97,7 +97,7 @@ def test_an_fmu_that_does_not_fit_is_one_line(
     version, arguments, more, message, monkeypatch, tmp_path, temporary, capsys
 ):
     build_crane(tmp_path / "crane.fmu", version, **arguments)
-    code, out = run(monkeypatch, tmp_path, version, more)
+    code, out = run(monkeypatch, tmp_path, version, more=more)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("servobench: plant fmu:")
     assert message in line

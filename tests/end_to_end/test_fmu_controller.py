@@ -122,7 +122,7 @@ def test_a_bad_mapping_is_refused_by_a_line(tmp_path, text, message):
     ],
 )
 def test_an_unlikely_mapping_is_remarked_on_by_the_process_that_the_user_sees(
-    tmp_path, monkeypatch, caplog, text, period, message
+    tmp_path, monkeypatch, caplog, no_figures, text, period, message
 ):
     (tmp_path / "map.fmu").write_bytes(exported("ukf_mfac:published", 2).read_bytes())
     (tmp_path / "mine.toml").write_text(text)
