@@ -30,7 +30,7 @@ from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
-from servobench.plant.robot.twin import CAMERA, LENS, deviated, parameter_names
+from servobench.plant.robot.twin import CAMERA, LENS, ball_rates, deviated, parameter_names
 
 LOG: Final = "the log"  # in error messages
 MAX_LATENCY: Final = 0.25  # [s]
@@ -57,6 +57,7 @@ TOLD: Final = 1.2  # [1] growth of a deviation with a prior of twice the width, 
 TOLD_SHARE: Final = 0.5  # [1] of its prior deviation, below which a direction is drawn from
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
 FITS: Final = 4
+STEP: Final = 1e-6  # [1] of differences, in prior deviations
 MAX_LAGS: Final = 100  # [frames] of the correlation time
 
 
@@ -174,51 +175,74 @@ class _Problem:
         self.scale = np.array([prior(name) for name in self.names])
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
-        self.z, self.pace = np.zeros(len(self.names)), 1.0
-        self.set(**{name: value for name, value in begin.items() if not name.startswith("camera")})
-        self.model, model = model, deviated(model, begin)
+        self.model, self.pace, model = model, 1.0, deviated(model, begin)
         tried = [self._placed(model, latency, 0.0) for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)]
         if not pixels:
             tried += [self._placed(model, min(tried)[1], turning) for turning in TURNINGS]
         self.spread, latency, turning, pose = min(tried)
-        self.set(latency=latency, turning=turning)
+        found = {**begin, "latency": latency, "turning": turning}
+        self.z = np.array([found.get(name, 0.0) for name in self.names]) / self.scale * ~self._of_camera
         self.model = self.model.with_camera(np.array(pose))
 
     def _placed(self, model: RobotModel, latency: float, turning: float) -> tuple[float, float, float, Any]:
         """Return the median error at a latency and a speed of turning, both, and the pose that fits best."""
         q = self.motion(self.time - latency)
         y = turned(self.y, -turning * (self.time - latency)) if turning else self.y
-        placed, error = fit_camera(model, q, y)
-        return error, float(latency), float(turning), placed.camera.tolist()
-
-    def set(self, **values: float) -> None:
-        """Change θ where the search of a fit begins, by name; a name that is no parameter of the log is left out."""
-        for name, value in values.items():
-            self.z[[each == name for each in self.names]] = value / prior(name)
+        pose, error = fit_camera(model, q, y)
+        return error, float(latency), float(turning), pose.tolist()
 
     def values(self, z: FloatArray) -> dict[str, float]:
         """Return θ by name."""
         return dict(zip(self.names, (self.scale * z).tolist(), strict=True))
 
+    def _exposed(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+        """Return when the frames were exposed, (k,) s, and the joints behind their gears then, (k, n) rad."""
+        steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
+        for _ in range(8):  # the swing is that at the exposure
+            phase = self.pace * time
+            time = steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
+        q = transmitted(self.motion(time), values["ripple"], RIPPLE_ORDER)
+        return time, q + values["backlash"] * self.play(time)
+
+    def _seen(self, values: Mapping[str, float], time: FloatArray, ball: FloatArray) -> FloatArray:
+        """Return h, (k, m), for the ball in the base frame, (k, 3) m, where a rigid tool holds it."""
+        model: Any = deviated(self.model, values)
+        y = model.feature_at(ball[:, None]) if isinstance(model, SetupModel) else model.to_camera(ball)
+        if "turning" in values:
+            y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
+        return np.asarray(y)
+
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
-        steady = values["latency"] + values["drift"] * (self.time - self.middle)
-        late = steady
-        for _ in range(8):  # the swing is that at the exposure
-            phase = self.pace * (self.time - late)
-            late = steady + values["swing_sin"] * np.sin(phase) + values["swing_cos"] * np.cos(phase)
-        time = self.time - late
-        q = self.motion(time)
-        q = transmitted(q, values["ripple"], RIPPLE_ORDER) + values["backlash"] * self.play(time)
-        y = np.asarray(deviated(self.model, values).feature(q))
-        if "turning" in values:
-            y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
-        return np.asarray(self.y - y)
+        time, q = self._exposed(values)
+        return np.asarray(self.y - self._seen(values, time, deviated(self.model, values).arm.ball_position(q)))
+
+    def jacobian(self, z: FloatArray) -> FloatArray:
+        """Return ∂(y − h)/∂z, (p, k, m): of the arm by the chain rule, of other parameters by differences."""
+        values = self.values(z)
+        time, q = self._exposed(values)
+        ball, motions = ball_rates(self.model, values, q)
+        by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
+        seen = self._seen(values, time, ball)
+        rates: dict[str, FloatArray] = {}
+        for name in set(self.names) - set(motions):
+            other = {**values, name: values[name] + STEP * prior(name)}
+            then, joints = self._exposed(other)
+            rates[name] = (self._seen(other, then, ball + np.matvec(by_joint, joints - q)) - seen) / STEP
+        # A motion of the ball acts as the opposite one of the camera.
+        by_ball = -np.stack([rates[name] / prior(name) for name in CAMERA[3:]], axis=-1)
+        rates |= {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
+        return -np.stack([rates[name] for name in self.names])
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
         """Return residuals with their weights (k,) and Σ^{-1/2}, and z for its prior."""
         return np.concatenate([(weights[:, None] * self.errors(z) @ root.T).ravel(), z])
+
+    def weighted_jacobian(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return the derivatives of `weighted` by z, (k m + p, p)."""
+        rates = (weights[:, None] * self.jacobian(z) @ root.T).reshape(len(z), -1)
+        return np.concatenate([rates.T, np.eye(len(z))])
 
     def pose(self, z: FloatArray) -> FloatArray:
         """Return the pose of the camera, (4, 4)."""
@@ -236,9 +260,9 @@ class _Problem:
 
     def swung(self, z: FloatArray) -> FloatArray:
         """Take the period with which the latency swings most likely, and return the z with the sizes there."""
-        swings, step = [name.startswith("swing") for name in self.names], 0.01 * (np.array(self.names) == "latency")
+        swings = [name.startswith("swing") for name in self.names]
         error = self.errors(z := np.where(swings, 0.0, z))
-        rates = (self.errors(z + step) - error) / (0.01 * prior("latency"))
+        rates = self.jacobian(z)[self.names.index("latency")] / prior("latency")
         weight = np.sum(rates**2, axis=1) + 1e-12
         late = -np.sum(rates * error, axis=1) / weight
         weight = np.sqrt(weight / (1.0 + (late / np.median(np.abs(late))) ** 2))
@@ -261,7 +285,8 @@ class _Problem:
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
     """Return places (k, 3) as a camera sees them that is turned about its optical axis by angles (k,) [rad]."""
-    return np.asarray(Rotation.from_euler("z", -angle[:, None]).apply(places))
+    (x, y, z), c, s = places.T, np.cos(angle), np.sin(angle)
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
 
 
 def played(joints: FloatArray, size: float) -> FloatArray:
@@ -271,14 +296,8 @@ def played(joints: FloatArray, size: float) -> FloatArray:
     return behind - joints
 
 
-def fit_camera(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[RobotModel, float]:
-    """Return a model with its camera at `camera_pose`, and the median of its errors there [unit of the feature]."""
-    placed = model.with_camera(camera_pose(model, joints, features))
-    return placed, float(np.median(np.linalg.norm(np.asarray(placed.feature(joints)) - features, axis=1)))
-
-
-def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> FloatArray:
-    """Return the pose of a fixed camera, (4, 4), that explains features best at joint positions, robustly.
+def fit_camera(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, float]:
+    """Return the robust pose of a fixed camera, (4, 4), and the median of its errors [unit of the feature].
 
     Args:
         model: nominal robot with one camera.
@@ -293,20 +312,21 @@ def camera_pose(model: RobotModel, joints: FloatArray, features: FloatArray) -> 
         matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
         points = np.ascontiguousarray(model.points(joints)[:, 0])
         found, turn, place, _ = cv2.solvePnPRansac(points, features.copy(), matrix, None, reprojectionError=20.0)
-        if not found:
-            return np.asarray(model.camera)
-        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
-        return np.asarray(np.linalg.inv(pose))
+        if found:
+            pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
+        pose[:] = np.linalg.inv(pose) if found else model.camera
+        return pose, float(np.median(np.linalg.norm(model.with_camera(pose).feature(joints) - features, axis=1)))
     points, weights = model.arm.ball_position(joints), np.ones(len(joints))
-    for _ in range(8):  # Kabsch's rotation with the weights of Weiszfeld's median
+    for _ in range(5):  # Kabsch's rotation with the weights of Weiszfeld's median
         share = weights / weights.sum()
         middle, mean = share @ points, share @ features
         U, _, V = np.linalg.svd((points - middle).T @ ((features - mean) * share[:, None]))
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
         pose[:3, :3], pose[:3, 3] = R, middle - R @ mean
         distance = np.linalg.norm(features - (points - pose[:3, 3]) @ R, axis=1)
-        weights = 1.0 / np.maximum(distance, np.median(distance) + 1e-9)
-    return pose
+        error = float(np.median(distance))
+        weights = 1.0 / np.maximum(distance, error + 1e-9)
+    return pose, error
 
 
 def identify(
@@ -339,7 +359,8 @@ def identify(
         weights = np.asarray((1.0 + distances) ** -0.25 if left else inliers, dtype=np.float64)
         solved: Any = least_squares(
             partial(problem.weighted, root=root, weights=weights),
-            z, method="lm", max_nfev=5 * fits * len(z), ftol=1e-6, xtol=1e-6,
+            z, partial(problem.weighted_jacobian, root=root, weights=weights),
+            method="lm", max_nfev=5 * fits * len(z), ftol=1e-4 if left else 1e-6, xtol=1e-6,
         )  # fmt: skip
         z = solved.x
         noise, inliers = robust_covariance(problem.errors(z))

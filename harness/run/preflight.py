@@ -97,7 +97,7 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
     """Return zeros of the joints, by a search along one after the other with the camera where it fits."""
-    rows, draws = frames_of(log, FRAMES), np.random.default_rng(0)
+    rows, draws = frames_of(log, FRAMES // 3), np.random.default_rng(0)
     q, y, n = log.joints[rows], log.features[rows], log.spec.n
     found: list[tuple[float, list[float]]] = []
     for _ in range(SEARCHES):

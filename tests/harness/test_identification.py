@@ -13,9 +13,10 @@ from kit.own import write
 from servobench import run
 from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.identification import (
-    camera_pose,
+    _Problem,
     command_response,
     correlation_time,
+    fit_camera,
     identify,
     joint_steps,
     read_log,
@@ -140,7 +141,23 @@ def test_poses_of_cameras_are_found_among_outliers():
         wanted = model.turned(np.array([0.1, -0.2, 0.7]), (0.4, 0.1, 0.4))
         y = np.array(wanted.feature(q))
         y[rng.random(len(y)) < 0.2] += 50.0 if sensing == "pixel" else 0.3
-        np.testing.assert_allclose(camera_pose(model, q, y), wanted.camera, atol=2e-3)
+        pose, error = fit_camera(model, q, y)
+        np.testing.assert_allclose(pose, wanted.camera, atol=2e-3)
+        assert error < 2e-3 * log.spec.feature.scale
+
+
+@pytest.mark.parametrize("sensing", ["position", "pixel"])
+def test_derivatives_of_residuals_are_their_differences(sensing):
+    log, _, model = logged(sensing)
+    problem = _Problem(log, model, 50, {})
+    z = problem.recentred(problem.z) + np.random.default_rng(0).normal(0.0, 0.2, len(problem.z))
+    root, weights = np.eye(log.spec.m) / log.spec.feature.scale, np.linspace(0.5, 1.0, len(problem.rows))
+    columns = [
+        (problem.weighted(z + step, root, weights) - problem.weighted(z - step, root, weights)) / 2e-5
+        for step in 1e-5 * np.eye(len(z))
+    ]
+    own = problem.weighted_jacobian(z, root, weights)
+    np.testing.assert_allclose(own, np.transpose(columns), atol=2e-5)
 
 
 def test_covariance_and_outliers_are_told_apart():
