@@ -345,7 +345,7 @@ def test_a_mistake_is_named_although_the_camera_was_moved_too():
 def test_frames_late_by_changing_times_are_no_clocks_that_drift():
     settings = {"random": {"duration": 60.0}, "run": {"lost_after": 20.0}, "Excite": {"swing": 0.25, "fastest": 0.5}}
     nominal, lines = find_robot("ur5").nominal, []
-    for seed in range(173400, 173406):
+    for seed in (173400, 173401):  # their drifts are 5.7 and 6.5 deviations of a steady latency
         made = run("docs/examples/excite.py", task="random", mismatch="jitter=200ms", seed=seed, settings=settings)
         lines.append(mistakes(read_log(logged()[0].spec, made.steps), nominal, {})[0])
     assert lines == [""] * len(lines)
