@@ -50,7 +50,7 @@ def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
 
 def main() -> None:
     """Print what was measured and the estimate."""
-    few, many = (2, 4) if asked_to_be_quick(__doc__) else (512, 1536)
+    few, many = (2, 4) if asked_to_be_quick(__doc__) else (256, 768)
     measured = {workers: measure(workers, few, many) for workers in (1, 2)}
     rows = [
         [workers, f"{start.wall:.1f} s", *(f"{1e3 * value:.2f} ms" for value in each)]

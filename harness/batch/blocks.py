@@ -55,7 +55,7 @@ from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import REMARKS, remark
 
-BLOCK: Final = 512  # [runs] that advance together
+BLOCK: Final = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
 RUN_ID: Final = "run_id"
 TEXTS: Final = ("robot", "engine", "task_kind", "feature_unit", "reason")  # columns of a row; others are numbers
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
