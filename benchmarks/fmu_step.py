@@ -49,7 +49,7 @@ def bare_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by three calls with prebuilt arguments."""
     world = cast(FmuWorld, plant.world)
     instance = world._instances.lanes[0].instance
-    library, component = instance._library.loaded, instance._component
+    library, component = instance.library.loaded, instance._component
     set_real, inputs = library.fmi2SetReal, (*world._command.variables, world._command.pointer())
     get_real, outputs = library.fmi2GetReal, (*world._result.variables, world._result.pointer())
     do_step, now, step, yes = library.fmi2DoStep, ctypes.c_double(), ctypes.c_double(PERIOD), ctypes.c_int(1)
