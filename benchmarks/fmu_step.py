@@ -107,10 +107,8 @@ def main() -> None:
     block = f"`Bench.step`, {BLOCK} runs side by side"
     steps = {BARE: bare_calls(plants[0]), "`Bench.step`, one run": plant_steps(plants[1]),
              "fmpy's `FMU2Slave`": fmpy_calls(plants[2]), block: plant_steps(plants[3])}  # fmt: skip
-    instants, runs = (
-        {name: itertools.count() for name in steps},
-        {name: BLOCK if name == block else 1 for name in steps},
-    )
+    instants = {name: itertools.count() for name in steps}
+    runs = {name: BLOCK if name == block else 1 for name in steps}
 
     def many(name: str) -> None:
         for k in itertools.islice(instants[name], CALLS // runs[name]):

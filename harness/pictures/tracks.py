@@ -194,13 +194,17 @@ class Ensemble(Shown):
     """The runs of one controller on one task, a row a seed."""
 
     time: FloatArray  # instants, (k,) [s]
-    period: float  # of control [s]; NaN of a run of one period
     error: FloatArray  # norm of the true error, (r, k) [`error_unit`]; infinite from an early end on
     jacobian_error: FloatArray  # relative, (r, k) [%]; NaN where it is not known
     step_time: FloatArray  # of all steps of the controller, (s,) [µs]
     settling_time: float  # median [s]; infinite if half of the runs never settled
     mostly_ended: bool  # whether half of the runs ended early, so that no median goes on to the end
     camera_moved_at: float  # when the camera was moved [s]; NaN where it was not
+
+    @property
+    def period(self) -> float:
+        """Control period [s]; NaN of a run of one period."""
+        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
 
     @property
     def shown_error(self) -> FloatArray:
@@ -259,7 +263,6 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
     return Ensemble(
         tracks[0].row,
         time,
-        float(time[1] - time[0]) if len(time) > 1 else math.nan,
         np.stack([padded(track.error(), math.nan if track.completed else math.inf) for track in few]),
         np.stack([padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]),
         times[times > 0.0],

@@ -18,7 +18,7 @@ from servobench.harness.run.knowledge import keep_networks
 from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
-from servobench.harness.run.metrics import FINAL_SPAN, judge_run
+from servobench.harness.run.metrics import final_rows, judge_run
 from servobench.harness.run.outcome import find_outcome, pose_errors
 from servobench.harness.run.request import OWN_ROBOT, RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
@@ -137,7 +137,7 @@ def _row(
 ) -> dict[str, Any]:
     """Return the row of a run in the table of runs."""
     spec, status, outcome = logged.spec, ending.status, ending.status
-    final = max(1, round(FINAL_SPAN / spec.period))  # rows of the last second
+    final = final_rows(spec.period)
     numbers = {name: float(np.asarray(value)) for name, value in metrics.items()}
     if status == COMPLETED:
         times = numbers["settling_time_s"], numbers["rms_error_evaluated"]
@@ -151,7 +151,7 @@ def _row(
         "status": status,
         "outcome": outcome,
         **numbers,
-        **{name: float(values[-final:].mean()) for name, values in pose.items() if len(values)},
+        **{name: float(values[final].mean()) for name, values in pose.items() if len(values)},
         "periods": len(logged),
         "reason": ending.reason,
         "mismatch_values": json.dumps(drawn.as_record()),

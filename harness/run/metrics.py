@@ -175,6 +175,11 @@ def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_
     return np.asarray(np.count_nonzero(sign * before < 0.0, axis=(-2, -1)))
 
 
+def final_rows(period: float) -> slice:
+    """Return the rows over which the steady state is averaged, for a control period [s]."""
+    return slice(-max(1, round(FINAL_SPAN / period)), None)
+
+
 def _path_length_ratio(run: Judged) -> FloatArray:
     way = norm(run.reference[..., 0] - run.feature[..., 0]) if run.fixed else path_length(run.reference)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -237,7 +242,7 @@ _ALL: Final = (
     Metric(
         "steady_state_error", "", "error of the last second", 2,
         "mean of e over the last second",
-        lambda run: run.error[..., -max(1, round(FINAL_SPAN / run.period)) :].mean(axis=-1),
+        lambda run: run.error[..., final_rows(run.period)].mean(axis=-1),
         tables={"moves": "Error", "runs": "Error"}, summary=Summary(1, "point_to_point"),
     ),
     Metric(
