@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -154,6 +155,13 @@ def train(
     say(f"kept in {cache_folder(NETWORKS)}")
 
 
+def new_folder() -> Path:
+    """Return a new folder below `results`, named after the time; a second one of the same second ends in _2."""
+    named = Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    further = (named.with_name(f"{named.name}_{number}") for number in itertools.count(2))
+    return next(each for each in itertools.chain([named], further) if not each.exists())
+
+
 def _carry_out(
     campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
 ) -> None:
@@ -164,7 +172,7 @@ def _carry_out(
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.installation import missing_extra
 
-    folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = out or new_folder()
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
         runs = results.load_runs(folder)

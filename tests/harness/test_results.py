@@ -27,6 +27,7 @@ from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results, tables
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.tables import NEEDED
+from servobench.harness.cli.runs import new_folder
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
@@ -179,6 +180,13 @@ def test_what_a_folder_lacks_is_named(refusal_of, monkeypatch, tmp_path, make, c
     make(tmp_path / "DIR")
     assert refusal_of(*command.split()).startswith(f"servobench: {words}")
     assert not (tmp_path / "new").exists()
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(3):
+        new_folder().mkdir(parents=True)
+    assert len(list(Path("results").iterdir())) == 3
 
 
 def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):
