@@ -36,7 +36,7 @@ import pyarrow as pa
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
-from servobench.harness.batch.sandbox import LOST, Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.batch.tables import MAX_TIME, MOST, lacking, unfit_names
 from servobench.harness.config.registry import (
     Offer,
@@ -51,7 +51,7 @@ from servobench.harness.config.source import SourceFile
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
+from servobench.harness.run.result import CRASHED, LOST, Ending, RunResult, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import REMARKS, remark
 

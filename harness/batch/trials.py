@@ -5,7 +5,6 @@ Code that ends its process, hangs or leaks memory costs one line, with its place
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -13,25 +12,17 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
-from servobench.harness.batch.processes import FOREIGN_TIME, Bounds
-from servobench.harness.batch.sandbox import LOST, Tell, call
 from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
-from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import PLACE, count_as_users, place_in_trace
-from servobench.harness.run.experiment import build
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, find_robot, read_mismatch
-from servobench.harness.run.resolution import resolve
-from servobench.harness.run.result import TIMED_OUT, Ending
-from servobench.harness.run.tasks import task_names
-from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.contract.faults import ConfigurationError, FmuError, RunFault, configuration_errors
+from servobench.harness.run.result import LOST, TIMED_OUT, Ending
+from servobench.plant.contract.faults import ConfigurationError, FmuError, configuration_errors
 
 if TYPE_CHECKING:
     from servobench.fmus.inspection import Validation
+    from servobench.harness.batch.sandbox import Tell
 
-PLANT: Final = "kinematic"  # on which controllers are tried
-TASK: Final = "exp1"
+ROBOT: Final = "ur5"  # for which plants and controllers are tried
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
 
@@ -45,10 +36,6 @@ class Tried(NamedTuple):
     name: str  # by which it is found
     summary: str = ""  # a line on it; empty where it cannot be used
     fault: str = ""  # why it cannot be used, in one line; empty where it can
-
-
-class _Trains(BaseException):
-    """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
 
 
 def explain(end: Ending, limit: float) -> str:
@@ -88,6 +75,9 @@ def attempt(
     Raises:
         ConfigurationError: that of the function.
     """
+    from servobench.harness.batch.processes import Bounds  # noqa: PLC0415 - lists of what is our own need no sandbox
+    from servobench.harness.batch.sandbox import call  # noqa: PLC0415 - as above
+
     found: dict[str, Any] = {}
 
     def receive(message: object) -> None:
@@ -147,7 +137,7 @@ def _choose(word: Word, given: str) -> str:
     return REGISTRIES[word].choose(given)
 
 
-def try_all(word: Word, robot: str = DEFAULT_ROBOT) -> list[Tried]:
+def try_all(word: Word, robot: str = ROBOT) -> list[Tried]:
     """Return all controllers or plants, with missing packages.
 
     Those of third parties are built once for a robot and thrown away, each in a sandbox.
@@ -176,13 +166,12 @@ def _try_here(word: Word, name: str, robot: str | None = None) -> Tried:
     """Return the result of a trial; it is built for a robot if there is one."""
     try:
         entry = find_controller(name) if word == "controller" else installed_plant(name, load=robot is not None)
-        if robot is not None and name not in task_names():
-            with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
-                (_build_controller if word == "controller" else _build_plant)(name, robot)
+        if robot is not None:
+            from servobench.harness.run.experiment import try_to_build  # noqa: PLC0415 - lists load no runner
+
+            try_to_build(word, name, robot)
     except ConfigurationError as error:
         return Tried(name, fault=str(error))
-    if name in task_names():
-        return Tried(name, fault=f"a task is called {name!r}, too; give the {word} another name")
     return Tried(name, str(entry.summary))
 
 
@@ -223,6 +212,7 @@ def validate(path: Path) -> Validation:
         ConfigurationError: it is not a co-simulation FMU of FMI 2 or 3.
     """
     from servobench.fmus.inspection import Validation  # noqa: PLC0415 - FMPy takes time to import
+    from servobench.harness.batch.processes import FOREIGN_TIME  # noqa: PLC0415 - as above
 
     answer, failure = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
     match answer:
@@ -237,25 +227,3 @@ def _validate(path: Path) -> tuple[Sequence[str], float | None]:
     with configuration_errors("", FmuError):
         found = validate_fmu(path)
     return found.problems, found.deviation
-
-
-def _build_controller(name: str, robot: str) -> None:
-    """Build the run of a controller and throw it away; a `ConfigurationError` of one line says why it cannot be."""
-    request = RunRequest(PLANT, name, TASK, read_mismatch("none"), 0, robot=robot)
-    build(resolve(request, Settings()), progress=_stop).plant.close()
-
-
-def _build_plant(name: str, robot_name: str) -> None:
-    """Build a plant and throw it away; see `_build_controller`."""
-    entry, robot, period = installed_plant(name), find_robot(robot_name), RunSettings().period
-    setup = PlantSetup(robot.nominal, robot.workspace.home, period, robot)
-    if entry.own_robot:
-        setup = PlantSetup(None, None, period)
-    with configuration_errors(f"plant {name}: "):
-        plant = entry.build(entry.config() if entry.config_for is None else entry.config_for(robot), setup)
-    with contextlib.suppress(Exception):  # `servobench check plant` reports it
-        plant.close()
-
-
-def _stop(_share: float, _what: str) -> None:
-    raise _Trains

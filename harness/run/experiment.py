@@ -5,6 +5,7 @@ A target that a task gives as a feature is compared with the reach of the nomina
 run is refused only where no true robot of that mismatch could do it.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from servobench.harness.run.request import RunRequest, RunSettings, find_robot, 
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting, Vector
-from servobench.harness.run.tasks import TASKS, find_task
+from servobench.harness.run.tasks import TASKS, find_task, task_names
 from servobench.plant.bench.plant import Plant, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -444,3 +445,34 @@ def _room(mismatch: Mismatch, robot: Robot, points: FloatArray) -> FloatArray:
     turn = min(math.pi, mismatch.size("camera_rotation") + mismatch.size("camera_move"))
     turned = 2.0 * math.sin(turn / 2.0) * np.linalg.norm(points - np.asarray(robot.workspace.centre), axis=-1)
     return np.asarray(arm + turned)
+
+
+def try_to_build(word: str, name: str, robot_name: str) -> None:
+    """Build a controller or plant for a robot and throw it away.
+
+    Raises:
+        ConfigurationError: it cannot be built, or a task has its name; one line.
+    """
+    if name in task_names():
+        raise ConfigurationError(f"a task is called {name!r}, too; give the {word} another name")
+    robot = find_robot(robot_name)
+    if word == "controller":
+        request = RunRequest("kinematic", name, "exp1", Mismatch(), 0, robot=robot_name)
+        with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
+            build(resolve(request, Settings()), progress=_stop).plant.close()
+        return
+    entry, period = find_plant(name), RunSettings().period
+    setup = PlantSetup(None, None, period) if entry.own_robot else None
+    setup = setup or PlantSetup(robot.nominal, robot.workspace.home, period, robot)
+    with configuration_errors(f"plant {name}: "), contextlib.suppress(RunFault):
+        plant = entry.build(entry.config() if entry.config_for is None else entry.config_for(robot), setup)
+        with contextlib.suppress(Exception):  # `servobench check plant` reports it
+            plant.close()
+
+
+class _Trains(BaseException):
+    """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
+
+
+def _stop(_share: float, _what: str) -> None:
+    raise _Trains

@@ -104,6 +104,7 @@ def installed(tmp_path, monkeypatch):
         modules.append(module)
 
     def forget():
+        registry._published.cache_clear()
         registry._points.cache_clear()
         registry._load.cache_clear()
 

@@ -123,7 +123,7 @@ def test_a_segmentation_fault_says_in_which_line(tmp_path):
     (tmp_path / "striking.py").write_text(plugin)
     code = "import sys; sys.argv = ['servobench', 'tasks']\n"
     code += (
-        "import servobench.harness.cli.main as main; main.command_line = lambda: __import__('striking')\nmain.main()"
+        "import servobench.harness.cli.main as main; main.command_line = lambda *_: __import__('striking')\nmain.main()"
     )
     ended = python("-c", code, path=tmp_path)
     assert ended.returncode == -signal.SIGSEGV

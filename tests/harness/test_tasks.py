@@ -115,7 +115,7 @@ def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_p
 def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
     points = "[servobench.tasks]\nspiral = spirals:Spiral\ncircle = spirals:Spiral\nlost = spirals:Lost\n"
     monkeypatch.syspath_prepend(install(tmp_path, "spirals", SPIRAL, points))
-    for function in (registry._points, registry._load):
+    for function in (registry._published, registry._points, registry._load):
         function.cache_clear()
     try:
         assert find_task("spiral").summary == "A spiral from the middle of the image outwards."
@@ -126,5 +126,5 @@ def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
         assert run.row["status"] == "completed"
     finally:
         monkeypatch.undo()
-        for function in (registry._points, registry._load):
+        for function in (registry._published, registry._points, registry._load):
             function.cache_clear()
