@@ -1,8 +1,13 @@
 """The command `servobench`, also as `python -m servobench`."""
 
+import gc
+import os
+
 
 def main() -> None:
     """Run the command, which is imported late: a worker process imports this module before it can end with it."""
+    gc.set_threshold(50_000)  # imports make lasting objects only: the collector would visit them again and again
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from servobench.harness.cli.main import main as command
 
     command()

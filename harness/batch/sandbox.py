@@ -35,10 +35,9 @@ from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits, show_size
-from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
+from servobench.harness.run.result import CRASHED, LOST, OUT_OF_MEMORY, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError
 
-LOST: Final = "the run killed the process that carried it out"
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
@@ -301,6 +300,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports
+    gc.set_threshold(700)  # as Python begins: the command has seldom collected
     guard = _Guard(link, limits)
     try:
         link.send_bytes(ALIVE)

@@ -61,9 +61,12 @@ def servobench(
     """Compare uncalibrated visual-servoing controllers: servobench COMMAND --help says more."""
 
 
-def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public name
-    """Return the command with all subcommands."""
-    root = typer.main.get_command(app)
+def command_line(called: str = "") -> Any:  # noqa: ANN401 - typer's own classes have no public name
+    """Return the command with all subcommands, or with that which is called: typer takes long to build them all."""
+    only = [each for each in app.registered_commands if each.callback and each.callback.__name__ == called]
+    part = typer.Typer(context_settings=app.info.context_settings, pretty_exceptions_enable=False)
+    part.registered_commands, part.registered_callback = only, app.registered_callback
+    root = typer.main.get_command(part if only else app)
     _hide_types(root)
     return root
 
@@ -119,7 +122,7 @@ def main() -> None:
         _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")
     try:
         with rejoining_words():
-            root = command_line()
+            root = command_line("".join(sys.argv[1:2]))
             words = in_known_number(root, sys.argv[1:]) or ["--help"]
             code = root(words, prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
