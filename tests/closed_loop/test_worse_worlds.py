@@ -14,21 +14,21 @@ from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve
 
 NEVER = math.nan
-SEEDS = (704, 707)  # whose settling times five kinds of processors give alike to a period or a hundredth
+SEEDS = (704, 711)  # whose settling times six kinds of processors give alike to a period or a hundredth
 METHODS = ("regression_mfac", "rbfnn_mfac:published", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published")
 # mismatch, duration [s], and for each of METHODS the settling times of SEEDS [s]
 WORLDS = {
     "severe": (
         "severe", 10.0,
-        ((0.68, 0.674), (1.195, 1.531), (2.163, 2.265), (2.077, 2.214), (1.172, 1.279)),
+        ((0.68, 0.833), (1.195, 1.694), (2.163, 2.603), (2.077, 2.437), (1.172, 1.482)),
     ),
     "camera_turned_by_120_degrees": (
         "moderate+camera_rotation=120deg", 10.0,
-        ((0.791, 0.962), (3.669, NEVER), (2.519, 2.487), (2.063, 2.265), (2.17, 3.77)),
+        ((0.791, 1.018), (3.669, NEVER), (2.519, 2.323), (2.063, 2.081), (2.17, 3.01)),
     ),
     "camera_moved_by_45_degrees": (
         "moderate+camera_move=45deg", 16.0,
-        ((8.412, 8.972), (9.496, 15.09), (9.175, 9.84), (9.189, 9.983), (9.495, 9.328)),
+        ((8.412, 8.491), (9.495, 10.704), (9.175, 9.732), (9.189, 10.027), (9.495, 9.48)),
     ),
 }  # fmt: skip
 
