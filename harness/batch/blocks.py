@@ -22,6 +22,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
+from functools import lru_cache
 from io import BytesIO
 from itertools import groupby, islice
 from pathlib import Path
@@ -304,20 +305,16 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
         case _:
             raise ValueError("it is not the result of a run")
     identity = episode.identity(cell.request)
-    known = _with_columns(cell, RunResult.failed(identity, Ending())).row
+    known = {**RunResult.failed(identity, Ending()).row, **cell.columns}
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
     own = (identity.keys() | cell.columns.keys()) - {"robot", "engine"}
-    if any(json.dumps(known[name]) != json.dumps(row[name]) for name in own):  # NaN is NaN, and 1 not 1.0 or true
+    if len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1:  # NaN is NaN, but 1 not 1.0
         raise ValueError("it is that of another run")
-    for name, value in row.items():
-        usual = str if name in TEXTS else float
-        kinds = (usual, type(None)) if known.get(name) is None else (type(known[name]),)
-        if not isinstance(value, kinds):
-            raise ValueError(  # noqa: TRY004 - the data are wrong, not the call
-                f"its {name} is {str(value)[:60]!r}, wanted a value of type {kinds[0].__name__}"
-            )
-        if name in MOST and isinstance(value, (int, float)) and (value < 0 or value > MOST[name]):
+    for name, wanted in _unfit_kinds(tuple((name, type(row[name]), type(known.get(name))) for name in row)):
+        raise ValueError(f"its {name} is {str(row[name])[:60]!r}, wanted a value of type {wanted}")
+    for name, most in MOST.items():
+        if (value := row.get(name)) is not None and (value < 0 or value > most):
             raise ValueError(f"its {name} is {value:g}")
     if wrong := unfit_names(tuple(row)):
         raise ValueError(f"it {wrong}")
@@ -325,6 +322,18 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
     return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
+
+
+@lru_cache(8)  # the rows of a batch have the same ones
+def _unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, str]]:
+    """Return the names and the wanted types of values, given with their types and known ones, that have other types."""
+    unfit = []
+    for name, kind, known in kinds:
+        usual = str if name in TEXTS else float
+        wanted = (usual, type(None)) if known is type(None) else (known,)
+        if not issubclass(kind, wanted):
+            unfit.append((name, wanted[0].__name__))
+    return unfit
 
 
 def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:

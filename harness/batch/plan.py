@@ -231,7 +231,9 @@ class SweepPlan:
                     raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
 
         def cell(place: Place, varied: Varied, request: RunRequest) -> Cell:
-            return Cell(replace(request, mismatch=place.vary(request.mismatch), varied=varied), place.columns)
+            if place.magnitude is not None or varied:
+                request = replace(request, mismatch=place.vary(request.mismatch), varied=varied)
+            return Cell(request, place.columns)
 
         places = [Place(axis, magnitude) for axis, magnitudes in self.axes for magnitude in magnitudes]
         names = [name for name, _ in self.settings]

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, SupportsIndex, TypeAlias
+from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 from annotated_types import Ge
 
@@ -223,7 +223,7 @@ def read_seed(seed: object) -> int:
     Raises:
         ConfigurationError: it is no such number.
     """
-    if isinstance(seed, bool) or not isinstance(seed, SupportsIndex) or operator.index(seed) < 0:
+    if isinstance(seed, bool) or not hasattr(seed, "__index__") or operator.index(seed) < 0:
         raise ConfigurationError(f"seed must be a non-negative integer, got {seed!r}")
     return operator.index(seed)
 
