@@ -296,7 +296,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     """
     for each in inherited:
         each.close()
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    signal.signal(signal.SIGTERM, lambda *_: link.close())  # no exception, which a destructor would swallow
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports

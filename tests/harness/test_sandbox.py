@@ -178,10 +178,10 @@ def test_a_runner_that_somebody_stops_or_interrupts_goes_on(name, tmp_path):
 
 def harm(how: str, tell) -> None:
     tell(["begins", how])
-    if how == "stop":
+    if how in ("SIGSTOP", "SIGTERM"):
         time.sleep(1.0)  # the guard passes the answer on first
-        os.kill(os.getppid(), signal.SIGSTOP)
-    while how in ("hang", "stop"):
+        os.kill(os.getppid(), signal.Signals[how])
+    while how not in ("return", "exit"):
         time.sleep(0.1)
     if how == "exit":
         os._exit(3)
@@ -194,7 +194,8 @@ def harm(how: str, tell) -> None:
         ("return", None),
         ("exit", ("crashed", "the run killed the process that carried it out: exit code 3")),
         ("hang", ("timed_out", "the run took longer than 3 s")),
-        ("stop", ("timed_out", "the run took longer than 3 s")),
+        ("SIGSTOP", ("timed_out", "the run took longer than 3 s")),
+        ("SIGTERM", ("crashed", "the run killed the process that carried it out")),
     ],
 )
 def test_a_call_returns_how_its_function_ended(how, end):
