@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.comparison import NO_ESTIMATE
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, carry_out_parts
+from servobench.harness.batch.lock import locked
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import method_styles, save_figure
@@ -50,24 +51,26 @@ def reproduce(
         The answers of all plants and divisions, by claim.
 
     Raises:
-        ConfigurationError: too few robots, or a plant that is no UR5.
+        ConfigurationError: too few robots, a plant that is no UR5, or a folder that cannot be written.
     """
     if robots < MIN_ROBOTS:
         raise ConfigurationError(f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, got {robots}")
     if any(find_plant(name).own_robot for name in plants):
         raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
+    made = {division: studies(plants, robots, division, mismatch) for division in divisions}
     answers, main = [], {}
-    for division in divisions:
-        folder = out / division.replace(" ", "_")
-        tables = carry_out_parts(studies(plants, robots, division, mismatch), folder, how)
-        answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
-        main[division] = tables[MAIN]
-        manifest = results.read_manifest(folder / MAIN)
-    answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
-    results.write_summary(out, main, manifest)
-    write_tables(answers, out)
-    write_atomically(out / "answers.md", partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"))
-    draw_answers(answers, out / FIGURES)
+    with locked(out):
+        for division, parts in made.items():
+            folder = out / division.replace(" ", "_")
+            tables = carry_out_parts(parts, folder, how)
+            answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
+            main[division] = tables[MAIN]
+            manifest = results.read_manifest(folder / MAIN)
+        answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
+        results.write_summary(out, main, manifest)
+        write_tables(answers, out)
+        write_atomically(out / "answers.md", partial(Path.write_text, data=markdown_table(answers), encoding="utf-8"))
+        draw_answers(answers, out / FIGURES)
     return answers
 
 
