@@ -1,7 +1,8 @@
 """How a sweep grows on a Dask cluster: measured on one and two workers of this machine, estimated beyond.
 
 The estimate has one bottleneck: the parent hands out blocks and writes rows on one processor, whose time a run is
-measured here, as is that of the scheduler. Workers are taken to be as fast as here and to have full blocks.
+measured here, as is that of the scheduler beyond its idle seconds, in which it looks after workers only. Workers are
+taken to be as fast as here and to have full blocks.
 """
 
 from __future__ import annotations
@@ -23,15 +24,22 @@ class Cost(NamedTuple):
 
     wall: float
     parent: float
-    scheduler: float
+    scheduler: float  # without that of an idle one
 
 
-def sweep(cluster: Any, robots: int) -> Cost:  # noqa: ANN401 - of Dask
-    """Return what a sweep over all methods takes; the scheduler lives in this process."""
+def sweep(cluster: Any, robots: int, idle: float = 0.0) -> Cost:  # noqa: ANN401 - of Dask
+    """Return what a sweep over all methods takes; the scheduler lives in this process, whose idle share is given."""
     names = "sweep", "--controllers", ",".join(METHODS), "--scheduler", cluster.scheduler_address
     used = time.process_time()
     parent, wall = sweep_times([sys.executable, "-m", "servobench", *names, "--seeds", seeds(robots)])
-    return Cost(wall, parent, time.process_time() - used)
+    return Cost(wall, parent, time.process_time() - used - idle * wall)
+
+
+def idle_share(seconds: float) -> float:
+    """Return the share of a processor [1] that this process takes while nothing is done."""
+    used = time.process_time()
+    time.sleep(seconds)
+    return (time.process_time() - used) / seconds
 
 
 def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
@@ -41,7 +49,8 @@ def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
     os.environ.update(MEMORY)
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
         sweep(cluster, 2 * workers)  # imports
-        small, large = (sweep(cluster, count) for count in (few, many))
+        idle = idle_share(min(10.0, few))
+        small, large = (sweep(cluster, count, idle) for count in (few, many))
     runs = (many - few) * len(METHODS)
     each = Cost(*((a - b) / runs for a, b in zip(large, small, strict=True)))
     start = Cost(*(a - few * len(METHODS) * b for a, b in zip(small, each, strict=True)))
