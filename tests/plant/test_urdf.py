@@ -3,6 +3,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from trimesh.creation import icosphere
 
 from kit.plants import configure, factory_ur5, odd_ur5, setup
 from servobench.plant.rendered.plants import BULLET
@@ -144,6 +145,9 @@ def read_obj(text) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_sphere_is_closed_round_and_turned_outwards():
     vertices, triangles = read_obj(sphere_obj(3))
+    same = icosphere(3)
+    assert (vertices == same.vertices).all()
+    assert (triangles == same.faces).all()
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=1e-12)
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
