@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import re
 import shutil
 import sys
 
@@ -64,7 +63,7 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "record --plant kinematic --out locked/films": (
         "locked", LOCKED, "locked/films cannot be written: Permission denied"),
     "claims --seeds 6 --plants kinematic --out locked/new": (
-        "locked", LOCKED, "results folder locked/new/best_equipped/main cannot be written: Permission denied"),
+        "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "tune --trials 2 --controllers ukf_mfac --out locked/new": (
         "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "shadow steps.csv --controller constant --out locked/seen.csv": (
@@ -85,7 +84,6 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "report results": ("results", HIDDEN, "path 'results' is not readable"),
     "collect results": ("results", LOCKED, "results folder results cannot be written: Permission denied"),
 }  # fmt: skip
-TRAINING = re.compile("^training networks once, .*\n", re.MULTILINE)  # of claims, where it takes long: when busy
 SCRIPT = """
 import contextlib, io, json, os, sys
 from servobench.harness.cli.main import main
@@ -129,7 +127,6 @@ def told(tmp_path_factory):
 def test_what_may_not_be_read_or_written_is_one_right_line(told, call):
     code, error, unchanged = told[call]
     assert code == 2, error
-    error = TRAINING.sub("", error)
     assert error.startswith("servobench: ")
     assert error.count("\n") == 1
     assert CASES[call][2] in error
