@@ -106,8 +106,8 @@ def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
         assert time.monotonic() - began < 12.0
         process.send_signal(signal.SIGCONT)
         process.kill()
-    if code < 0 or "Timeout (" in said:  # ur-rtde itself may crash or hang while it reconnects
-        return
+    if code < 0 or "Timeout (" in said:
+        pytest.skip("ur-rtde itself crashed or hung while it connected anew")
     row = servobench.load(tmp_path / "lost").runs.iloc[0]
     assert row["status"] == "crashed"
     assert re.search("timed out|cannot be heard any more|has ended|takes no command|JSON", row["reason"]), row["reason"]
