@@ -15,10 +15,7 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.figure import Figure
 
-METHODS = (
-    "ukf_mfac", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published",
-    "regression_mfac",
-)  # fmt: skip
+METHODS = "ukf_mfac", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published"
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110

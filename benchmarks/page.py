@@ -3,6 +3,9 @@
     make benchmark                                                   # a quarter of an hour on two quiet processors
     python benchmarks/page.py --against 0.1.0=/path/to/a/checkout    # with an older version beside this one
     python benchmarks/page.py --quick --out page                     # tests the page, not the speed
+    python benchmarks/page.py --only scaling                         # all else, the date too, is that of the last time
+
+What each benchmark prints is kept in build/benchmarks, so that one that fails loses none of the others.
 
 An older checkout that needs other libraries has its environment in `.venv`.
 """
@@ -22,23 +25,18 @@ import measuring
 from servobench.harness.config.installation import installed_version
 
 ROOT = Path(__file__).resolve().parents[1]
-LIBRARIES = (
-    "numpy", "scipy", "casadi", "daqp", "fmpy", "pybullet", "mujoco", "pandas", "distributed", "filterpy", "do-mpc",
-)  # fmt: skip
+LIBRARIES = "numpy", "casadi", "pybullet", "mujoco", "distributed", "filterpy", "do-mpc"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def run(script: str, *options: str) -> str:
-    """Return what a benchmark prints.
-
-    Raises:
-        SystemExit: it failed.
-    """
+def run(script: str, *options: str) -> str | None:
+    """Return what a benchmark prints, None if it fails."""
     environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": str(ROOT / ".package")}
     command = [sys.executable, str(ROOT / "benchmarks" / f"{script}.py"), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        sys.exit(f"{script} failed: {done.stderr.strip()}")
+        sys.stderr.write(f"{script} failed: {done.stderr.strip()}\n")
+        return None
     return "\n".join(line for line in done.stdout.splitlines() if not line.startswith("pybullet build")).strip()
 
 
@@ -66,22 +64,28 @@ def main() -> None:
     pictures = options.out / "pictures"
     extra = {each: ["--picture", f"{pictures}/performance_{each}.png"] for each in ("shares", "scaling")}
     extra["throughput"] = ["--against", *options.against]
+    kept, failed = (options.out if options.quick else ROOT / "build") / "benchmarks", []
+    kept.mkdir(parents=True, exist_ok=True)
 
     def filled(marker: re.Match[str]) -> str:
-        script = marker[1]
-        if script == "machine":
-            return machine()
-        if options.only and script not in options.only:
-            return ""
-        began = time.perf_counter()
-        printed = run(script, *extra.get(script, []), *(["--quick"] if options.quick else []))
-        sys.stderr.write(f"{script}: {time.perf_counter() - began:.0f} s\n")
-        return printed
+        script, began = marker[1], time.perf_counter()
+        last = kept / f"{script}.md"
+        if not options.only or script in options.only:
+            quick = ["--quick"] if options.quick else []
+            printed = machine() if script == "machine" else run(script, *extra.get(script, []), *quick)
+            sys.stderr.write(f"{script}: {time.perf_counter() - began:.0f} s\n")
+            if printed is None:
+                failed.append(script)
+            else:
+                last.write_text(printed, encoding="utf-8")
+        return last.read_text(encoding="utf-8") if last.exists() else ""
 
     template = Path(__file__).with_name("page.md").read_text(encoding="utf-8")
     page = re.sub(r"^<!-- (\w+) -->$", filled, template, flags=re.MULTILINE)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "performance.md").write_text(page, encoding="utf-8")
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from measuring import asked_to_be_quick, table, times_in_turns
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.detection import Window, whole, window_around
+from servobench.plant.rendered.detection import whole
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.plants import BULLET, MUJOCO
@@ -30,7 +30,6 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import CAMERA, view_matrix
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.workspace import BALL_RADIUS
 
 ROBOT = find_robot("ur5")
 HOME, MODEL = np.array(ur5.HOME), ROBOT.nominal
@@ -105,12 +104,8 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     scene = opened.enter_context(closing(MujocoScene(Room(MODEL.arm, config.scenery, ROBOT))))
     simulation.start(HOME)
     scene.place(HOME)
-    camera, world = CAMERA, plant.world
-    around = window_around(MODEL.to_camera(scene.ball_position()), BALL_RADIUS, camera)
-    if around is None:
-        raise RuntimeError("the ball is not in the image")
 
-    def bare(window: Window) -> None:
+    def bare() -> None:
         model, data = simulation._model, simulation._data
         shapes, placed = simulation._shapes, simulation._placed
         data.qpos[:], data.qvel[:] = HOME, 0.0
@@ -122,29 +117,23 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
                 mujoco.mj_kinematics(shapes, placed)
                 mujoco.mj_comPos(shapes, placed)
                 mujoco.mj_collision(shapes, placed)
-        scene.draw(camera, MODEL.X_BC, window)
+        scene.draw(CAMERA, MODEL.X_BC, whole(CAMERA))
 
-    return {
-        "bare calls": lambda _: bare(whole(camera)),
-        "bare calls with the ball's window alone": lambda _: bare(around),
-        "`Bench.step`": lambda speed: plant.step(Command(speed)),
-        "of it: drives and physics": lambda speed: world._simulation.advance(world._joints, speed, STEPS),
-        "of it: image, its noise and detection": lambda _: world.see(),
-    }
+    return {"bare calls": lambda _: bare(), "`Bench.step`": lambda speed: plant.step(Command(speed))}
 
 
 def rows(make: Callable[[RenderedConfig, ExitStack], Calls], repeats: int) -> list[list[str]]:
-    """Return a row for each call, with and without scenery: the median [ms] and its ratio to the bare calls."""
-    found = []
-    for place, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
+    """Return a row for each call: with and without scenery the median [ms] and its ratio to the bare calls."""
+    found: dict[str, list[str]] = {}
+    for config in (RenderedConfig(), RenderedConfig(scenery=False)):
         with ExitStack() as opened:
             calls = make(config, opened)
             speeds = [0.2 * np.sin(0.3 * k) * np.ones(6) for k in range(repeats)]
             rounds = [times_in_turns({name: partial(call, u) for name, call in calls.items()}, 1) for u in speeds]
         medians = 1e3 * np.median([[time for (time,) in each.values()] for each in rounds], axis=0)
         for name, value in zip(calls, medians, strict=True):
-            found.append([f"{name}, {place}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
-    return found
+            found.setdefault(name, [name]).extend((f"{value:.2f} ms", f"{value / medians[0]:.2f}"))
+    return list(found.values())
 
 
 def main() -> None:
@@ -152,7 +141,7 @@ def main() -> None:
     repeats = 3 if asked_to_be_quick(__doc__) else 200
     for name, module, make in (("bullet", "pybullet", bullet_calls), ("mujoco", "mujoco", mujoco_calls)):
         if find_spec(module) is not None:
-            print(table([f"period of `{name}`", "a period", "× bare calls"], rows(make, repeats)))
+            print(table([f"period of `{name}`", "with scenery", "× bare", "without", "× bare"], rows(make, repeats)))
 
 
 if __name__ == "__main__":

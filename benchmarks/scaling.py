@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import measuring
-from measuring import METHODS, PERIODS, microseconds, processor_time, resolved_runs
+from measuring import PERIODS, microseconds, processor_time, resolved_runs
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
@@ -31,6 +31,7 @@ from servobench.plant.contract.signals import Observation, PlantSpec, trusted_ob
 
 PERIOD, FEATURES, BLOCK = 0.05, 3, 128
 PREVIEW = 20  # periods
+METHODS = "ukf_mfac", "ukf_mfac:published", "rbfnn_mfac:published"
 Lead = tuple[int, ...]
 Curve = tuple[list[int], list[float]]  # sizes and costs of a period of one run [s]
 Curves = dict[str, Curve]
@@ -117,6 +118,7 @@ def loop(lead: Lead, n: int, method: str) -> Callable[[], object]:
 
 def curve(make: Callable[..., Callable[[], object]], lead: Lead, sizes: Sequence[int], calls: int, *more: Any) -> Curve:  # noqa: ANN401
     """Return the cost of what `make(lead, size, *more)` returns, for one run."""
+    calls = max(calls // 6, 2) if lead else calls
     return list(sizes), [processor_time(make(lead, size, *more), calls) / (*lead, 1)[0] for size in sizes]
 
 
@@ -149,19 +151,17 @@ def main() -> None:
     count, calls = (2, 2) if given.quick else (None, 60)
     sizes = {"units": (50, 100, 150, 300, 600), "horizon": (4, 7, 10, 20, 40), "joints": (3, 6, 12, 24)}
     units, horizons, joints = (each[:count] for each in sizes.values())
-    both = (), (BLOCK,)
     panels = {
         "runs side by side": ("runs", side_by_side([2**i for i in range(10)][:count])),
         "units of a network": ("units a joint column", {
-            f"`rbf`, {sides(lead)}": curve(network, lead, units, calls) for lead in both
+            f"`rbf`, {sides((BLOCK,))}": curve(network, (BLOCK,), units, calls)
         }),
         "horizon": ("periods", {
-            **{f"`mpc`, no limit active, {sides(lead)}": curve(plan, lead, horizons, calls, 0.01) for lead in both},
+            f"`mpc`, no limit active, {sides((BLOCK,))}": curve(plan, (BLOCK,), horizons, calls, 0.01),
             "`mpc`, limits active, one run": curve(plan, (), horizons, calls, 1.0),
         }),
         "joints": ("joints", {
-            f"`{method}`, {sides(lead)}": curve(loop, lead, joints, calls, method)
-            for method in ("broyden", "ukf_mfac", "ukf_mpc") for lead in both
+            f"`ukf_mfac`, {sides(lead)}": curve(loop, lead, joints, calls, "ukf_mfac") for lead in ((), (BLOCK,))
         }),
     }  # fmt: skip
     rows = []

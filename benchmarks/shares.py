@@ -22,15 +22,14 @@ from servobench.harness.run.experiment import build
 from servobench.plant.bench.bench import Bench
 
 COLOURS = {
-    "plant": style.BLUE, "truth": style.SKY, "estimator": style.VERMILION, "law": style.ORANGE, "aids": style.GREEN,
-    "log": style.YELLOW, "judging": style.PURPLE, "building": style.WINE, "rest": "#BBBBBB",
+    "plant": style.BLUE, "estimator": style.VERMILION, "law": style.ORANGE, "aids": style.GREEN,
+    "log, judging": style.YELLOW, "building": style.WINE, "rest": "#BBBBBB",
 }  # fmt: skip
 SHARED = (
     (episode, ("build", "build_together"), "building"),
-    (episode, ("judge_run", "_judge_together"), "judging"),
-    (log.StepLog, ("add", "steps"), "log"),
-    (Bench, ("reset", "step"), "plant"),
-    (Bench, ("truth",), "truth"),
+    (episode, ("judge_run", "_judge_together"), "log, judging"),
+    (log.StepLog, ("add", "steps"), "log, judging"),
+    (Bench, ("reset", "step", "truth"), "plant"),
 )  # functions that all methods share
 Costs = dict[str, dict[str, float]]  # [µs a period] by method and part
 
@@ -123,7 +122,7 @@ def main() -> None:
     for owner, names, part in SHARED:
         for name in names:
             clock.wrap(owner, name, part)
-    sides = {"single runs": measure(clock, runs, together=False), "side by side": measure(clock, block, together=True)}
+    sides = {"alone": measure(clock, runs, together=False), "block": measure(clock, block, together=True)}
     rows = [
         [side, f"`{method}`", *(f"{value:.1f}" for value in (*parts.values(), sum(parts.values())))]
         for side, costs in sides.items()

@@ -83,10 +83,10 @@ def main() -> None:
     given = options(__doc__, quick=QUICK, against=against, rounds=(2, "of this checkout"))
     others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in given.against)}
     plants, methods = ["kinematic", "fmu"], list(METHODS)
-    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 84), 15, given.rounds, 1000
+    counts, old_counts, alone, rounds = (256, 512), (4, 84), 15, given.rounds
     if given.quick:
-        plants, methods, counts, old_counts, alone, rounds, whole = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1, 10
-    rows, totals = [], []
+        plants, methods, counts, old_counts, alone, rounds = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1
+    rows = []
     for plant in plants:
         for method in methods:
             now = min(period_in_sweep(HERE, plant, method, *counts) for _ in range(rounds))
@@ -96,13 +96,8 @@ def main() -> None:
                 cells.append(f"**{ratio(period_in_sweep, now, checkout, plant, method, *old_counts)}**")
                 cells.append(ratio(period_alone, single, checkout, plant, method, alone))
             rows.append([plant, f"`{method}`", *cells])
-        used, wall = sweep(HERE, plant, ",".join(methods), whole, 2)
-        periods = whole * len(methods) * PERIODS
-        totals.append([plant, f"**{wall:.1f} s**", f"{used:.1f} s", f"{1e6 * used / periods:.1f} µs"])
     names = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
-    print(table(["plant", "method", "now, in a sweep", "now, alone", *names], rows))
-    print(f"{whole} robots × {len(methods)} methods × {PERIODS} periods = {periods:,} periods on two workers:\n")
-    print(table(["plant", "wall-clock time", "processor time of all processes", "a period"], totals))
+    print(table(["plant", "method", "in a sweep", "alone", *names], rows))
 
 
 if __name__ == "__main__":

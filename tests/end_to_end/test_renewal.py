@@ -321,8 +321,8 @@ def test_the_quick_page_of_performance_has_tables_and_its_picture(tmp_path):
     limits, shares = (rows for _, _, rows in page_tables(page))
     assert limits[-1][0] == "the package, a block of 4"
     sides = {row[0] for row in shares}
-    assert sides == {"single runs", "side by side"}
-    assert len(shares) == 12
+    assert sides == {"alone", "block"}
+    assert len(shares) == 10
     for row in shares:
         parts, whole = map(float, row[2:-1]), float(row[-1])
         assert abs(sum(parts) - whole) < 0.5
