@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from measuring import METHODS, PERIODS, asked_to_be_quick, seeds, sweep_times, table
 
 CORES = (16, 1000)
+IDLE = 5.0  # [s] over which the share of an idle scheduler is measured
 # Dask has its workers return freed memory at once; arrays of a block would be mapped anew in every period.
 MEMORY = {"MALLOC_TRIM_THRESHOLD_": "1000000000", "MALLOC_MMAP_THRESHOLD_": "1000000000"}
 
@@ -49,7 +50,7 @@ def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
     os.environ.update(MEMORY)
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
         sweep(cluster, 2 * workers)  # imports
-        idle = idle_share(min(10.0, few))
+        idle = idle_share(IDLE)
         small, large = (sweep(cluster, count, idle) for count in (few, many))
     runs = (many - few) * len(METHODS)
     each = Cost(*((a - b) / runs for a, b in zip(large, small, strict=True)))
@@ -65,13 +66,23 @@ def main() -> None:
         [workers, f"{start.wall:.1f} s", *(f"{1e3 * value:.2f} ms" for value in each)]
         for workers, (start, each) in measured.items()
     ]
-    print(table(["workers", "start-up", "wall-clock time a run", "parent's processor time a run", "scheduler's"], rows))
+    print(
+        table(
+            [
+                "workers",
+                "start-up",
+                "wall-clock time a run",
+                "parent's processor time a run",
+                "scheduler's, beyond idle",
+            ],
+            rows,
+        )
+    )
     start, one = measured[1]
     serial = max(max(each.parent, each.scheduler) for _, each in measured.values())
     print(
-        f"The busiest single process beside the workers needs "
-        f"{1e3 * serial:.2f} ms a run, {serial / one.wall:.1%} of the run itself: by that alone more than about "
-        f"{one.wall / serial:.0f} workers gain nothing.\n"
+        f"The busiest single process beside the workers needs {1e3 * serial:.2f} ms a run, {serial / one.wall:.1%} of "
+        f"the run itself: by that alone more than about {one.wall / serial:.0f} workers gain nothing.\n"
     )
     runs, rows = 200_000 * len(METHODS), []
     for cores in CORES:

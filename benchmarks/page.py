@@ -25,7 +25,7 @@ import measuring
 from servobench.harness.config.installation import installed_version
 
 ROOT = Path(__file__).resolve().parents[1]
-LIBRARIES = "numpy", "casadi", "pybullet", "mujoco", "distributed", "filterpy", "do-mpc"
+LIBRARIES = "numpy", "casadi", "fmpy", "pybullet", "mujoco", "distributed", "filterpy", "do-mpc"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -80,10 +80,10 @@ def ratio(cost: Callable[..., float], now: float, checkout: Path, plant: str, me
 def main() -> None:
     """Print a table of times and ratios, and the time of the whole."""
     against = {"nargs": "*", "default": [], "metavar": "NAME=PATH", "help": "older checkouts"}
-    given = options(__doc__, quick=QUICK, against=against, rounds=(2, "of this checkout"))
+    given = options(__doc__, quick=QUICK, against=against, rounds=(1, "of this checkout"))
     others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in given.against)}
     plants, methods = ["kinematic", "fmu"], list(METHODS)
-    counts, old_counts, alone, rounds = (256, 512), (4, 84), 15, given.rounds
+    counts, old_counts, alone, rounds = (256, 1280), (4, 84), 15, given.rounds
     if given.quick:
         plants, methods, counts, old_counts, alone, rounds = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1
     rows = []

@@ -326,7 +326,11 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
 
 @lru_cache(8)  # the rows of a batch have the same ones
 def _unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, str]]:
-    """Return the names and the wanted types of values, given with their types and known ones, that have other types."""
+    """Return the columns with a value of a wrong type, each with the name of the right one.
+
+    Args:
+        kinds: name, type of the value and type of the known value of each column.
+    """
     unfit = []
     for name, kind, known in kinds:
         usual = str if name in TEXTS else float

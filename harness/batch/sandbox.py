@@ -300,7 +300,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     processes.adopt_orphans()
     processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports
-    gc.set_threshold(700)  # as Python begins: the command has seldom collected
+    gc.set_threshold(700)  # of Python 3.11; a copy of the command has a larger one, under which memory piles up
     guard = _Guard(link, limits)
     try:
         link.send_bytes(ALIVE)

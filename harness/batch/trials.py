@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from servobench.fmus.inspection import Validation
     from servobench.harness.batch.sandbox import Tell
 
-ROBOT: Final = "ur5"  # for which plants and controllers are tried
 IMPORT_LIMIT = 120.0  # [s] to import code that a user names: large libraries are allowed
 TRIAL_LIMIT = 30.0  # [s] to load and build one of many: slow imports are allowed
 
@@ -137,7 +136,7 @@ def _choose(word: Word, given: str) -> str:
     return REGISTRIES[word].choose(given)
 
 
-def try_all(word: Word, robot: str = ROBOT) -> list[Tried]:
+def try_all(word: Word, robot: str) -> list[Tried]:
     """Return all controllers or plants, with missing packages.
 
     Those of third parties are built once for a robot and thrown away, each in a sandbox.

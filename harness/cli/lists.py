@@ -139,7 +139,7 @@ def _listed(word: Word) -> list[dict[str, str]]:
 
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
-        for each in try_all(word)
+        for each in try_all(word, DEFAULT_ROBOT)
     ]
     return found + [{"name": name, "error": line} for name, line in REGISTRIES[word].unused_points()]
 

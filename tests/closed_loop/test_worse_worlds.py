@@ -14,7 +14,7 @@ from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import resolve
 
 NEVER = math.nan
-SEEDS = (704, 711)  # whose settling times six kinds of processors give alike to a period or a hundredth
+SEEDS = (704, 711)  # whose settling times networks of four kernels of OpenBLAS give alike to a period or a hundredth
 METHODS = ("regression_mfac", "rbfnn_mfac:published", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published")
 # mismatch, duration [s], and for each of METHODS the settling times of SEEDS [s]
 WORLDS = {

@@ -3,7 +3,7 @@
 One run of the task exp2 with seed 0 and the mismatch moderate is made for each method on each plant. Of each of its
 first periods the table `golden_runs.csv` keeps Σ_i i u_i [rad/s], a sum in which a change of any joint's command
 shows; a change of the plant shows in the commands of the next period. `spread` is how far rounding moves these sums:
-the largest deviation among the kernels of OpenBLAS, numpy's widest loops and a start one unit in the last place away,
+the largest deviation among the kernels of OpenBLAS, numpy's AVX-512 and a start one unit in the last place away,
 each with networks of its own, at least `MIN_SPREAD`. The table is renewed by this file, which prints the line that
 CHANGELOG.md is then to have.
 """
@@ -33,12 +33,12 @@ MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow comm
 TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
 SUMS = [f"u{k:02d}" for k in range(PERIODS)]
 SIMD = "NPY_DISABLE_CPU_FEATURES"  # loops of numpy that are not used, by the names in `numpy.show_config()`
-WIDEST = "X86_V4 AVX512_ICL AVX512_SPR"
-KERNEL = {"OPENBLAS_CORETYPE": "Haswell", SIMD: WIDEST}  # of the table: what all processors of ten years have
+AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
+KERNEL = {"OPENBLAS_CORETYPE": "Haswell", SIMD: AVX512}  # of the table: AVX2, which x86-64 processors have since 2015
 OTHER_KERNELS = ("Sandybridge", "Nehalem")
 VARIANTS: tuple[Mapping[str, str], ...] = (
     *({"OPENBLAS_CORETYPE": kernel} for kernel in OTHER_KERNELS),
-    {SIMD: ""},  # the widest loops of this processor, with another exp where there are such
+    {SIMD: ""},  # with AVX-512 where the processor has it, and so another exp
     {"GOLDEN_START": "next"},
 )
 
