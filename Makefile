@@ -78,6 +78,7 @@ release: $(VENV)/ready
 
 # Write docs/performance.md and its pictures: a quarter of an hour on two quiet processors. AGAINST="0.1.0=/path" adds a checkout.
 benchmark: $(VENV)/ready
+	@$(BIN)/python -m pip install --quiet --no-build-isolation --editable ".[benchmarks]"
 	$(BIN)/python benchmarks/page.py $(if $(AGAINST),--against $(AGAINST))
 
 $(VENV)/ready: requirements.lock pyproject.toml
