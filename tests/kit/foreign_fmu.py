@@ -34,8 +34,7 @@ def describe_exchange(derivatives: bool = True) -> str:
     text = describe(2)
     names = ("wheel.slew", "wheel.luff")
     rates = "".join(
-        f'<ScalarVariable name="der({name})" valueReference="{60 + i}"><Real derivative="{i + 1}"/></ScalarVariable>'
-        for i, name in enumerate(names)
+        _scalar(f"der({name})", 60 + i, "", f'<Real derivative="{i + 1}"/>') for i, name in enumerate(names)
     )
     first = text.count("<ScalarVariable") + 1
     outputs, rows = "".join(map(_unknown, (1, 2, 5, 6))), "".join(map(_unknown, (first, first + 1)))
@@ -56,6 +55,12 @@ def mapping(version: int) -> str:
     )
 
 
+def _scalar(name: str, reference: int, attributes: str, kind: str) -> str:
+    """Return a variable of FMI 2 with the element of its type."""
+    head = f'<ScalarVariable name="{name}" valueReference="{reference}" {attributes}'
+    return f"{head.rstrip()}>{kind}</ScalarVariable>"
+
+
 def _unknown(index: int) -> str:
     return f'<Unknown index="{index}"/>'
 
@@ -73,11 +78,9 @@ def describe(version: int) -> str:
             head = f'<Float64 name="{name}" valueReference="{reference}" {common} {start}>'
             rows.append(f"{head}{inner}</Float64>")
         else:
-            rows += [
-                f'<ScalarVariable name="{name}.{part}" valueReference="{reference + i}" {common}>'
-                + (f'<Real start="{starts[i]}"/></ScalarVariable>' if starts else "<Real/></ScalarVariable>")
-                for i, part in enumerate(("slew", "luff"))
-            ]
+            reals = [f'<Real start="{start}"/>' for start in starts] if starts else ["<Real/>"] * 2
+            parts = zip(("slew", "luff"), reals, strict=True)
+            rows += [_scalar(f"{name}.{part}", reference + i, common, real) for i, (part, real) in enumerate(parts)]
     if version == 3:
         rows.append('<Float64 name="quirk" valueReference="50" causality="parameter" variability="tunable" start="0"/>')
         rows.append(
@@ -95,18 +98,12 @@ def describe(version: int) -> str:
         ]
         head = 'fmiVersion="3.0" modelName="Crane" instantiationToken="x"'
     else:
-        rows.append(
-            '<ScalarVariable name="quirk" valueReference="50" causality="parameter" variability="tunable">'
-            '<Real start="0"/></ScalarVariable>'
-        )
-        rows.append(
-            '<ScalarVariable name="gear" valueReference="70" causality="parameter" variability="tunable">'
-            '<Integer start="1"/></ScalarVariable>'
-        )
-        common = 'causality="parameter" variability="fixed"'
+        tunable, fixed = (f'causality="parameter" variability="{word}"' for word in ("tunable", "fixed"))
         rows += [
-            f'<ScalarVariable name="on" valueReference="80" {common}><Boolean start="true"/></ScalarVariable>',
-            f'<ScalarVariable name="mood" valueReference="90" {common}><String start=""/></ScalarVariable>',
+            _scalar("quirk", 50, tunable, '<Real start="0"/>'),
+            _scalar("gear", 70, tunable, '<Integer start="1"/>'),
+            _scalar("on", 80, fixed, '<Boolean start="true"/>'),
+            _scalar("mood", 90, fixed, '<String start=""/>'),
         ]
         head = 'fmiVersion="2.0" modelName="Crane" guid="x"'
     return (
@@ -146,17 +143,10 @@ def build_pilot(path: Path) -> Path:
     reals = [(f"{name}.{part}", causality) for name, causality in
              (("goal", "input"), ("hook", "input"), ("angle", "input"), ("rate", "output"))
              for part in ("slew", "luff")]  # fmt: skip
-    rows = [
-        f'<ScalarVariable name="{name}" valueReference="{k}" causality="{causality}"><Real/></ScalarVariable>'
-        for k, (name, causality) in enumerate(reals)
-    ]
-    common = 'causality="parameter" variability="tunable"'
-    rows.append(f'<ScalarVariable name="gain" valueReference="8" {common}><Real start="2"/></ScalarVariable>')
-    rows += [
-        f'<ScalarVariable name="clear.{part}" valueReference="{20 + k}" causality="input" variability="discrete">'
-        "<Boolean/></ScalarVariable>"
-        for k, part in enumerate(("slew", "luff"))
-    ]
+    rows = [_scalar(name, k, f'causality="{causality}"', "<Real/>") for k, (name, causality) in enumerate(reals)]
+    rows.append(_scalar("gain", 8, 'causality="parameter" variability="tunable"', '<Real start="2"/>'))
+    discrete = 'causality="input" variability="discrete"'
+    rows += [_scalar(f"clear.{part}", 20 + k, discrete, "<Boolean/>") for k, part in enumerate(("slew", "luff"))]
     description = (
         '<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="Pilot" guid="y">'
         f'<CoSimulation modelIdentifier="pilot"/><ModelVariables>{"".join(rows)}</ModelVariables>'

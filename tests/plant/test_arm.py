@@ -6,7 +6,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from kit.plants import factory_ur5, nominal_ur5, odd_ur5
+from kit.plants import factory_ur5, nominal_ur5
 from servobench.fmus.export import arm_layout
 from servobench.fmus.sources import core_functions
 from servobench.fmus.variables import Actuation, parameters_of
@@ -21,7 +21,7 @@ from servobench.plant.robot.arm import (
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, rotation_matrix
 from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
-from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, ur5_arm
+from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, TOOL, ur5_arm
 
 
 def poses(count, n=6, seed=0):
@@ -122,27 +122,11 @@ def test_what_a_model_hands_out_cannot_be_changed():
     assert not any(array.flags.writeable for array in (model.X_BC, *model.observe(np.zeros(6))[:2]))
 
 
-def test_offsets_and_gear_ratios_act_on_the_reported_position():
-    nominal, arm = ur5_arm(), odd_ur5()
-    unmoved = SerialArm(JOINT_NAMES, nominal.translation, nominal.rpy, arm.joint_offset, arm.gear_ratio, nominal.tool)
-    q = poses(5)
-    expected = nominal.ball_position(arm.gear_ratio * q + arm.joint_offset)
-    np.testing.assert_allclose(unmoved.ball_position(q), expected, atol=1e-15)
-
-
 def test_factory_calibration_is_millimetres_from_the_data_sheet():
     q = poses(200)
     distance = np.linalg.norm(factory_ur5().ball_position(q) - ur5_arm().ball_position(q), axis=-1)
     assert np.median(distance) > 1e-4
     assert distance.max() < 0.01
-
-
-def test_camera_and_base_frame_are_inverse_to_each_other():
-    model = nominal_ur5()
-    points = np.random.default_rng(0).normal(size=(4, 5, 3))
-    np.testing.assert_allclose(model.to_base(model.to_camera(points)), points, atol=1e-15)
-    homogeneous = np.linalg.inv(model.X_BC) @ [*points[0, 0], 1.0]
-    np.testing.assert_allclose(model.to_camera(points[0, 0]), homogeneous[:3], atol=1e-15)
 
 
 def calibration(**changes):
@@ -158,14 +142,11 @@ def calibration(**changes):
         (calibration().replace(b"wrist_2", b"wrist_7"), "lacks 'wrist_2'; wanted 'kinematics' with the blocks"),
         (calibration().replace(b"yaw", b"jaw"), "lacks 'yaw'"),
         (calibration(shoulder={"x": "long"}), "holds something that is not a number"),
-        (calibration(shoulder={"x": [1.0]}), "holds something that is not a number"),
         (calibration(shoulder=None), "holds something that is not a number"),
         (calibration(wrist_1={"z": float("nan")}), "holds a number that is not finite"),
-        (calibration(wrist_1={"z": float("inf")}), "holds a number that is not finite"),
         (None, "cannot be read: No such file"),
         (b"{ not: [yaml", "is not valid YAML"),
         (b"", "holds something that is not a number"),
-        (b"- 1\n- 2\n", "holds something that is not a number"),
         (b"other: 1\n", "lacks 'kinematics'"),
         (b"\xff\xfe\xfa\x00", "is no text in UTF-8; save it in this encoding"),
     ],

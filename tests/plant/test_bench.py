@@ -55,18 +55,9 @@ def walk(plant, commands=COMMANDS):
     return [plant.step(Command(u)) for u in commands]
 
 
-def test_commands_are_clipped_to_the_limits_of_each_joint():
-    np.testing.assert_allclose(bench().step(Command([9.0, -9.0])).joint_position, [0.1, -0.05])
-
-
 def test_a_command_arrives_after_its_delay_and_the_arm_rests_until_then():
     moved = [o.joint_position[0] for o in walk(bench(delay=0.2), np.full((4, 2), 0.5))]
     np.testing.assert_allclose(moved, [0.0, 0.0, 0.05, 0.1], atol=1e-15)
-
-
-def test_a_feature_arrives_after_its_latency():
-    late, prompt = walk(bench(sensing=SensingConfig(0.0, 0.3))), walk(bench())
-    assert [o.feature[0] for o in late] == [0.0, 0.0, 0.0, *(o.feature[0] for o in prompt[:-3])]
 
 
 def test_the_latency_of_a_frame_swings_about_its_mean_by_its_time_of_exposure():

@@ -27,10 +27,6 @@ def test_it_sees_the_circle_of_the_workspace_with_a_margin(height):
     assert (pixel < (CAMERA.width - 15, CAMERA.height - 15)).all()
 
 
-def test_the_vertical_field_of_view_spans_the_image():
-    assert 2 * np.degrees(np.arctan(0.5 * CAMERA.height / CAMERA.focal)) == pytest.approx(CAMERA.vertical_fov)
-
-
 def test_the_opengl_matrices_lead_to_the_same_pixel_and_depth_as_the_pinhole_model():
     model = nominal_ur5()
     p_C = points(50)

@@ -63,12 +63,6 @@ def test_other_colours_and_the_dark_are_not_found(colour):
     assert find_patch(ball_image((0.0, 0.1, 1.2), colour)[0]) is None
 
 
-def test_opacity_is_ignored():
-    rgb, _ = ball_image((0.1, 0.0, 1.2))
-    rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, dtype=np.uint8)])
-    np.testing.assert_array_equal(find_patch(rgba).columns, find_patch(rgb).columns)
-
-
 def test_a_ball_that_the_border_cuts_is_not_found():
     columns_to_the_right = (CAMERA.width / 2) / CAMERA.focal
     assert detect(*ball_image((columns_to_the_right * 1.2, 0.0, 1.2))) is None

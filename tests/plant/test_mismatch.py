@@ -117,6 +117,8 @@ def test_a_negative_magnitude_is_refused():
         ("camera_rotation", "0:90:45deg", ("0deg", "45deg", "90deg")),
         ("links", "0:30:10%", ("0%", "10%", "20%", "30%")),
         ("tool", "5/12.5mm", ("5mm", "12.5mm")),
+        ("outliers", "0:40:20%", ("0%", "20%", "40%")),
+        ("stable", "1/1.5/2", ("1", "1.5", "2")),
         ("gear_ratio", "0.1", ("0.1",)),
         ("joint_offsets", "0:0.3:0.1rad", ("0rad", "0.1rad", "0.2rad", "0.3rad")),
     ],

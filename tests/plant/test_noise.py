@@ -14,7 +14,7 @@ from servobench.plant.contract import sensing as families
 from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, without_disturbance
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.robot.mismatch import Mismatch, parse_magnitudes
+from servobench.plant.robot.mismatch import Mismatch
 
 COUNT = 20_000
 LEVEL = 1e-3  # of a Kolmogorov-Smirnov test: the seeds are fixed, so it passes for ever or never
@@ -206,10 +206,3 @@ def test_a_word_of_the_sensor_sets_its_setting_and_draws_no_other_robot(axis):
 def test_a_word_of_the_sensor_that_is_wrong_is_refused(text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Mismatch.parse(text)
-
-
-def test_axes_of_the_sensor_have_ranges():
-    assert [each.number for each in parse_magnitudes("outliers", "0:40:20%")] == [0.0, 20.0, 40.0]
-    assert [str(each) for each in parse_magnitudes("stable", "1/1.5/2")] == ["1", "1.5", "2"]
-    with pytest.raises(ValueError, match="such as stable=1:2:0.5; got 'x'"):
-        parse_magnitudes("stable", "x")

@@ -17,6 +17,8 @@ from servobench.plant.robot.ur5 import HOME
 
 PERIOD = 0.05
 COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))
+MODEL, SAMPLE = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
+MOVED = SAMPLE.moved(MODEL, find_robot("ur5"))  # the same robot after a move of its camera
 
 
 @pytest.fixture(params=ALL_PLANTS)
@@ -26,8 +28,7 @@ def entry(request) -> PlantEntry:
 
 @pytest.fixture
 def plant(entry):
-    model, _ = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%"), find_robot("ur5"), 1)
-    made = entry.build(entry.config(), PlantSetup(model, np.array(HOME), PERIOD))
+    made = entry.build(entry.config(), PlantSetup(MODEL, np.array(HOME), PERIOD))
     yield made
     made.close()
 
@@ -38,23 +39,12 @@ def test_it_keeps_the_contract_of_plants(entry):
     assert len(report.findings) == 9
 
 
-def test_a_run_begins_at_its_start_at_time_zero_and_time_counts_periods(plant):
-    observation = plant.reset(0)
-    assert (observation.time, plant.spec.period) == (0.0, PERIOD)
-    assert observation.feature.shape == (plant.spec.m,)
-    np.testing.assert_allclose(observation.joint_position, HOME, atol=3e-5)  # half a step of the encoders
-    np.testing.assert_allclose(plant.truth().feature, observation.feature, atol=0.01)
-    assert [plant.step(Command(u)).time for u in COMMANDS] == [(k + 1) * PERIOD for k in range(len(COMMANDS))]
-
-
 def test_a_start_of_the_wrong_size_is_refused(entry):
     with pytest.raises(ValueError, match="start must have shape"):
         entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))
 
 
 def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_camera(plant):
-    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
-
     def continued() -> list[bytes]:
         seen = [plant.step(Command(u)) for u in COMMANDS]
         truth = plant.truth()
@@ -64,7 +54,7 @@ def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_
     plant.reset(5)
     before = plant.save()
     first = continued()
-    plant.move_camera(sample.moved(model, find_robot("ur5")).X_BC)
+    plant.move_camera(MOVED.X_BC)
     between = plant.save()
     second = continued()
     for state, expected in ((before, first), (between, second), (before, first)):
@@ -86,19 +76,17 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams_and_another_s
 
 
 def test_a_moved_camera_shows_the_ball_elsewhere_as_late_as_its_frames_and_until_the_reset(entry):
-    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
-    moved = sample.moved(model, find_robot("ur5"))
     config = override("plant", entry.config(), {"sensing": {"latency": 3 * PERIOD}})
     start = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # far from the point about which the camera turns
-    with contextlib.closing(entry.build(config, PlantSetup(model, start, PERIOD))) as plant:
+    with contextlib.closing(entry.build(config, PlantSetup(MODEL, start, PERIOD))) as plant:
         plant.reset(0)
         before = plant.truth()
-        plant.move_camera(moved.X_BC)
+        plant.move_camera(MOVED.X_BC)
         seen = [plant.step(Command(np.zeros(6))) for _ in range(5)]
         after, q = plant.truth(), seen[-1].joint_position
         assert np.linalg.norm(after.feature - before.feature) > 0.03
-        np.testing.assert_allclose(after.feature, moved.feature(q), atol=5e-5)
-        np.testing.assert_allclose(after.jacobian, moved.jacobian(q), atol=5e-5)
+        np.testing.assert_allclose(after.feature, MOVED.feature(q), atol=5e-5)
+        np.testing.assert_allclose(after.jacobian, MOVED.jacobian(q), atol=5e-5)
         for k, observation in enumerate(seen):
             assert np.linalg.norm(observation.feature - (before if k < 3 else after).feature) < 0.01
         plant.reset(0)

@@ -11,7 +11,7 @@ from kit.robots import FOUR_JOINTS
 from servobench.plant.cameras.optics import Optics, in_image, project
 from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
 from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
-from servobench.plant.cameras.setups import SensingSetup, SetupModel
+from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.camera import CAMERA
@@ -241,8 +241,3 @@ def test_features_without_a_derivative_are_differentiated():
     np.testing.assert_allclose(
         numeric.change(points, motions, optics), exact.change(points, motions, optics), rtol=1e-6, atol=1e-5
     )
-
-
-def test_a_set_up_is_a_value_that_can_be_compared():
-    assert SensingSetup("pixel", "", ("u",), "px", project) != SETUPS["pixel"]
-    assert Sensing.parse("pixel") == Sensing(SETUPS["pixel"])

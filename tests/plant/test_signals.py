@@ -22,25 +22,17 @@ def test_an_observation_must_be_finite(name):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("speed", "lower", "period", "message"),
     [
-        ({"joint_velocity_limit": np.array([0.0])}, "joint_velocity_limit must be positive"),
-        ({"joint_velocity_limit": np.ones(2)}, "joint_velocity_limit must have shape"),
-        ({"joint_lower": np.array([3.0])}, "joint_lower must be below joint_upper"),
-        ({"period": 0.0}, "period must be positive"),
+        ([0.0], [-1.0], 0.1, "joint_velocity_limit must be positive"),
+        ([1.0, 1.0], [-1.0], 0.1, "joint_velocity_limit must have shape"),
+        ([1.0], [3.0], 0.1, "joint_lower must be below joint_upper"),
+        ([1.0], [-1.0], 0.0, "period must be positive"),
     ],
 )
-def test_a_spec_is_checked(change, message):
-    values = {
-        "joint_names": ("a",),
-        "feature_names": ("x",),
-        "joint_velocity_limit": np.ones(1),
-        "joint_lower": -np.ones(1),
-        "joint_upper": np.ones(1),
-        "period": 0.1,
-    }
+def test_a_spec_is_checked(speed, lower, period, message):
     with pytest.raises(ValueError, match=message):
-        PlantSpec.of_joints(**(values | change))
+        PlantSpec.of_joints(("a",), ("x",), np.array(speed), np.array(lower), np.ones(1), period)
 
 
 def test_a_number_is_held_against_its_bounds():
