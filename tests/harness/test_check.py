@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 import servobench
-from kit.broken_controllers import BROKEN, NOTED
+from kit.broken_controllers import BROKEN, NOTED, stepping
 from kit.command import python
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.check.controllers import check_controller
@@ -17,40 +17,11 @@ from servobench.plant.kinematic import ENTRY as KINEMATIC
 
 COUNT = itertools.count()
 
-KILLERS = f"""
-import ctypes
-import os
-import time
-{WHOLE}
-
-class Segv(Mine):
-    def step(self, observation, reference):
-        return servobench.Command(np.full(self.n, ctypes.string_at(0)[0]))
-
-
-class Hang(Mine):
-    def step(self, observation, reference):
-        while True:
-            time.sleep(0.1)
-
-
-class Exit(Mine):
-    def step(self, observation, reference):
-        os._exit(9)
-"""
-
-
-def line_of(code: str) -> int:
-    """Return the line of a piece of code in the file of killers."""
-    return 1 + KILLERS[: KILLERS.index(code)].count("\n")
-
-
-KILLING = {
-    "Segv": ("command", f"kill.py:{line_of('string_at')}: it killed the process by SIGSEGV"),
-    "Hang": ("command", f"kill.py:{line_of('time.sleep')}: no answer after 3 s; is there a loop without an end"),
-    "Exit": ("command", "it ended the process with exit code 9"),
+KILLING = {  # step of the controller, begin of the line of its check
+    "strikes": ("ctypes.string_at(0)", "mine.py:18: it killed the process by SIGSEGV"),
+    "hangs": ("while True: time.sleep(0.1)", "mine.py:18: no answer after 3 s; is there a loop without an end"),
+    "ends": ("os._exit(9)", "it ended the process with exit code 9"),
 }
-
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
@@ -99,12 +70,8 @@ def test_it_is_said_what_gives_a_class_the_aids_and_why_it_cannot_have_them(tmp_
     write(tmp_path, WHOLE.replace("np.zeros(self.n)", "0.0 * reference[1, 0] * np.ones(self.n)"))
     line = "without aids, and it cannot have them as it is: mine.py:16: IndexError"
     assert findings("./mine.py")["aids"][1].startswith(line)
-
-
-def test_an_answer_that_is_no_command_has_its_place_also_within_the_chain_of_the_aids(tmp_path):
-    text = WHOLE.replace('"""Does not move."""', "aids = servobench.EQUIPPED")
-    write(tmp_path, text.replace("servobench.Command(np.zeros(self.n))", "np.zeros(self.n)"))
-    assert findings("./mine.py")["command"][1].startswith("mine.py:15: step must return a Command, got ndarray")
+    write(tmp_path, stepping("return np.zeros(self.n)", inside="\n    aids = servobench.EQUIPPED"))
+    assert findings("./mine.py")["command"][1].startswith("mine.py:18: step must return a Command, got ndarray")
 
 
 IN_PARTS = """
@@ -150,15 +117,14 @@ def test_parts_that_say_so_are_checked_side_by_side(tmp_path):
     assert findings("./mine.py")["side by side"] == ("failed", line)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KILLING)
-def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(output_of, tmp_path, kind):
-    write(tmp_path, KILLERS, "kill.py")
-    check, line = KILLING[kind]
-    lines = output_of("check", f"./kill.py:{kind}", "--limit", "3", code=1).splitlines()
+@pytest.mark.parametrize("what", KILLING)
+def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(output_of, tmp_path, what):
+    step, line = KILLING[what]
+    write(tmp_path, stepping(step))
+    lines = output_of("check", "./mine.py", "--limit", "3", code=1).splitlines()
     assert lines[0].split() == ["ok", "constructor"]
-    assert lines[1].startswith(f"failed {check:15s}{line}"), lines
-    assert lines[2:] == [f"./kill.py:{kind}: 1 of 2 checks failed"]
+    assert lines[1].startswith(f"failed {'command':15s}{line}"), lines
+    assert lines[2:] == ["./mine.py: 1 of 2 checks failed"]
 
 
 def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(refusal_of, tmp_path):

@@ -176,14 +176,6 @@ def test_more_runs_than_were_asked_for_are_of_another_folder():
     assert results.missing_line(4, 0) == ""  # a folder that says nothing
 
 
-def test_examined_files_are_counted_with_parts_and_what_stands_beside(begun):
-    before = examine(begun)
-    assert (before.files, before.left_out) == (1 + len([*(begun / results.PARTS).glob("[0-9]*.*")]), [])
-    (begun / "report.html").write_text("mine")
-    results.vouch(begun, [begun / "report.html"])
-    assert examine(begun).files == before.files + 1
-
-
 @pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(begun, whole, what):
     part = begun / results.part_name(8, results.RUNS)
@@ -236,13 +228,6 @@ def test_a_damaged_table_is_named_and_made_again(ended, whole, what):
     assert_same(ended, whole)
 
 
-def test_an_intact_folder_is_left_as_it_is(ended, whole):
-    resumed = run(ended, resume=True)
-    assert (resumed.repeated, resumed.notes) == (0, [])
-    assert read_sums(ended) == read_sums(whole)
-    assert_same(ended, whole)
-
-
 def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(ended, half, whole):
     name = results.part_name(8, results.RUNS)
     (ended / results.PARTS).mkdir()
@@ -275,23 +260,19 @@ def test_no_bit_of_a_folder_can_change_in_silence(ended, whole):
     results.load_runs(ended)
 
 
-def test_a_manifest_that_is_lost_beside_whole_tables_is_written_anew(ended, whole):
-    (ended / results.MANIFEST).unlink()
-    found = examine(ended)
-    assert (found.runs, found.wanted) == (RUNS, 0)
-    resumed = run(ended, resume=True)
-    assert (resumed.repeated, resumed.notes) == (0, [f"{ended / results.MANIFEST} is missing: it is written anew"])
-    assert_same(ended, whole)
-
-
-def test_a_lost_log_of_failures_is_made_from_the_table(ended, whole):
-    (ended / results.FAILURES).write_bytes(b"")
+@pytest.mark.parametrize(
+    ("name", "damage", "note"),
+    [
+        (results.MANIFEST, lambda path: path.unlink(), "is missing: it is written anew"),
+        (results.FAILURES, lambda path: path.write_bytes(b""), "is empty: it is written anew, without traces"),
+    ],
+)
+def test_what_is_lost_beside_whole_tables_is_written_anew_without_a_run(ended, whole, name, damage, note):
+    damage(ended / name)
     (finding,) = examine(ended).findings
-    assert finding.name == results.FAILURES
-    assert finding.remedy.endswith("--resume; it is written anew, without traces")
+    assert finding.name == name
     resumed = run(ended, resume=True)
-    assert resumed.repeated == 0
-    assert resumed.notes == [f"{ended / results.FAILURES} is empty: it is written anew, without traces"]
+    assert (resumed.repeated, resumed.notes) == (0, [f"{ended / name} {note}"])
     assert_same(ended, whole)
 
 

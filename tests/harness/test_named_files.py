@@ -13,13 +13,30 @@ from servobench.harness.config.source import neighbours
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
 
-MINE = "import helper\nfrom laws import gain\n" + WHOLE.replace(
-    "np.zeros(self.n)", "np.full(self.n, gain.VALUE * helper.SPEED)"
-)
-CODE = {"mine.py": MINE, "helper.py": "SPEED = 0.01\n", "laws/__init__.py": "", "laws/gain.py": "VALUE = 1.0\n"}
+BESIDE = "import helper\n" + WHOLE.replace("np.zeros(self.n)", "np.full(self.n, helper.SPEED)")
+BELOW = "from laws import gain\n" + WHOLE.replace("np.zeros(self.n)", "np.full(self.n, gain.SPEED)")
+CALIBRATION = Path(ur5.shipped_calibration()).read_text()
 WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0.4,0.1,1.2\n1,0.4,0.0,1.2\n"
+SETUP = """from servobench.plant.cameras.setups import SensingSetup
+SIDE = SensingSetup('side', '', ('x', 'y', 'z'), 'm', lambda points, optics: points[..., 0, 0, :])
+"""
+EYE = "width = 640\nheight = 480\nvertical_fov = 60.0\n"
+PATH = {"waypoints": {"file": "path.csv", "settle": 0.1}}
+SHORT = {"exp1": {"duration": 0.2}, "random": {"duration": 0.2}}
+CASES = {  # the files, the first of which changes, and what is asked for
+    "robot": ({"arm.yaml": CALIBRATION}, {"robot": "./arm.yaml", "tasks": ["random"]}),
+    "mismatch": ({"factory.yaml": CALIBRATION}, {"mismatches": ["factory=./factory.yaml"]}),
+    "task": ({"path.csv": WAYPOINTS}, {"tasks": ["waypoints"], "settings": PATH}),
+    "plant": ({"cell.py": CELL}, {"plants": ["./cell.py"]}),
+    "sensing": ({"side.py": SETUP}, {"plants": ["kinematic"], "sensings": ["./side.py"]}),
+    "camera": ({"eye.toml": EYE}, {"robot": "ur5 with eye.toml", "sensings": ["pixel"]}),
+    "module": ({"helper.py": "SPEED = 0.01\n", "mine.py": BESIDE}, {"controllers": ["./mine.py"]}),
+    "module of a package": (
+        {"laws/gain.py": "SPEED = 0.01\n", "laws/__init__.py": "", "mine.py": BELOW},
+        {"controllers": ["./mine.py"]},
+    ),
+}
 pytestmark = pytest.mark.usefixtures("own_folder")
-SHORT = {"exp1": {"duration": 0.2}}
 
 
 def write(files):
@@ -28,79 +45,20 @@ def write(files):
         Path(name).write_text(text)
 
 
-def copied(name, source):
-    Path(name).write_bytes(Path(source).read_bytes())
-
-
-def robot():
-    copied("arm.yaml", ur5.shipped_calibration())
-    return {"robot": "./arm.yaml", "tasks": ["random"], "settings": {"random": {"duration": 0.2}}}
-
-
-def mismatch():
-    copied("factory.yaml", ur5.shipped_calibration())
-    return {"mismatches": ["factory=./factory.yaml"]}
-
-
-def task():
-    write({"path.csv": WAYPOINTS})
-    return {"tasks": ["waypoints"], "settings": {"waypoints": {"file": "path.csv", "settle": 0.1}}}
-
-
-def plant():
-    write({"cell.py": CELL})
-    return {"plants": ["./cell.py"]}
-
-
-def sensing():
-    write(
-        {
-            "side.py": "from servobench.plant.cameras.setups import SensingSetup\n"
-            "SIDE = SensingSetup('side', '', ('x', 'y', 'z'), 'm', lambda points, optics: points[..., 0, 0, :])\n"
-        }
-    )
-    return {"plants": ["kinematic"], "sensings": ["./side.py"]}
-
-
-def camera():
-    write({"eye.toml": "width = 640\nheight = 480\nvertical_fov = 60.0\n"})
-    return {"robot": "ur5 with eye.toml", "sensings": ["pixel"]}
-
-
-CASES = {  # what is asked for, and which file changes
-    "robot": (robot, "arm.yaml"),
-    "mismatch": (mismatch, "factory.yaml"),
-    "task": (task, "path.csv"),
-    "plant": (plant, "cell.py"),
-    "sensing": (sensing, "side.py"),
-    "camera": (camera, "eye.toml"),
-}
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_a_folder_is_not_resumed_with_another_version_of_a_file(case):
-    ask, name = CASES[case]
-    refused(["constant"], name, **({"settings": SHORT} | ask()))
-
-
-def test_nor_with_another_version_of_a_module_beside_a_file():
-    write(CODE)
-    refused(["./mine.py"], "helper.py", settings=SHORT)
-    write(CODE)
-    refused(["./mine.py"], "laws/gain.py", resume=True, settings=SHORT)
-
-
-def refused(controllers, name, *, resume=False, **asked):
-    """Begin a folder, or go on with it, and resume it; then change the file `name`."""
-    asked |= {"out": "folder"}
-    begun = servobench.compare(controllers, resume=resume, **asked)
-    resumed = servobench.compare(controllers, resume=True, **asked)
+    files, asked = CASES[case]
+    write(files)
+    asked = {"controllers": ["constant"], "settings": SHORT, "out": "folder"} | asked
+    begun = servobench.compare(**asked)
+    resumed = servobench.compare(resume=True, **asked)
     assert resumed["run_id"].tolist() == begun["run_id"].tolist()
+    name = next(iter(files))
     with Path(name).open("a") as file:
         file.write("\n")
     line = f"^folder was begun with another version of (\\./)?{name}; name another folder with --out, or bring"
     with pytest.raises(ConfigurationError, match=line):
-        servobench.compare(controllers, resume=True, **asked)
+        servobench.compare(resume=True, **asked)
 
 
 def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():

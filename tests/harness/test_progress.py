@@ -1,6 +1,7 @@
 """Lines about long commands, for pipes and files."""
 
 import io
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -9,18 +10,10 @@ from servobench.harness.cli import progress
 from servobench.harness.cli.progress import FIRST_LINE, ConsoleObserver, Lines, telling
 
 
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(progress, "Lines", lambda: Lines(clock))
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(progress, "Lines", lambda: Lines(lambda: clock.now))
     return clock
 
 
@@ -39,9 +32,8 @@ def test_short_work_is_silent_and_long_work_tells_the_time_left(capsys, clock):
     assert capsys.readouterr().err == f"frames: 25 %, about {6 * FIRST_LINE:.0f} s left\n"
 
 
-def test_a_long_night_is_few_lines(capsys):
-    clock = Clock()
-    lines = Lines(clock)
+def test_a_long_night_is_few_lines(capsys, clock):
+    lines = progress.Lines()
     for k in range(8 * 3600):
         clock.now += 1.0
         lines.tell(k / (8 * 3600), "runs")

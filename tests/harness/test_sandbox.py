@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
 
-from kit.command import PACKAGE, left_behind, python, wait_for
+from kit.command import left_behind, python, start, wait_for
 from kit.nightly import some
 from servobench.harness.batch import sandbox
 from servobench.harness.batch.processes import Limits
@@ -20,19 +21,26 @@ from servobench.harness.batch.sandbox import Pool, Task
 from servobench.plant.contract.faults import ConfigurationError
 
 
+@contextmanager
+def importing(text, name, folder, monkeypatch):
+    """Yield a pool of one worker, whose guard first imports a module with this text and name."""
+    (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    workers = Pool(1, Limits(), (name,))
+    try:
+        yield workers
+    finally:
+        workers.stop()
+
+
 @pytest.mark.slow
 def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(tmp_path, monkeypatch):
-    (tmp_path / "slow_import.py").write_text("import time\n\ntime.sleep(60.0)\n")
-    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sandbox, "GUARD_START", 0.5)
     before = set(multiprocessing.active_children())
-    workers = Pool(1, Limits(), ("slow_import",))
-    try:
+    with importing("import time\n\ntime.sleep(60.0)\n", "slow_import", tmp_path, monkeypatch) as workers:
         for _ in range(2):
             with pytest.raises(ConfigurationError, match=r"^a worker process has not started within 0\.5 s$"):
                 workers.submit(Task(print, b"")).result(60.0)
-    finally:
-        workers.stop()
     assert set(multiprocessing.active_children()) == before
 
 
@@ -49,25 +57,17 @@ if not first.exists() or {always}:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(("SIGKILL", "SIGTERM", "SIGHUP", "SIGSTOP"), "SIGTERM", "SIGSTOP"))
 def test_a_guard_that_is_ended_or_stopped_while_it_starts_is_started_once_more(name, tmp_path, monkeypatch):
-    (tmp_path / "ends_once.py").write_text(ONCE.format(name=name, always=False))
-    monkeypatch.syspath_prepend(tmp_path)
-    workers = Pool(1, Limits(), ("ends_once",))
-    try:
+    with importing(ONCE.format(name=name, always=False), "ends_once", tmp_path, monkeypatch) as workers:
         assert workers.submit(Task(harm, pickle.dumps("return"))).result(300.0).items == [["begins", "return"]]
-    finally:
-        workers.stop()
 
 
 @pytest.mark.slow
 def test_of_a_guard_that_is_ended_whenever_it_starts_the_signal_is_named(tmp_path, monkeypatch):
-    (tmp_path / "ends_always.py").write_text(ONCE.format(name="SIGKILL", always=True))
-    monkeypatch.syspath_prepend(tmp_path)
-    workers = Pool(1, Limits(), ("ends_always",))
-    try:
-        with pytest.raises(ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"):
-            workers.submit(Task(harm, pickle.dumps("return"))).result(300.0)
-    finally:
-        workers.stop()
+    with (
+        importing(ONCE.format(name="SIGKILL", always=True), "ends_always", tmp_path, monkeypatch) as workers,
+        pytest.raises(ConfigurationError, match="^a worker process was ended while it started: SIGKILL$"),
+    ):
+        workers.submit(Task(harm, pickle.dumps("return"))).result(300.0)
 
 
 UNTOUCHED = """
@@ -141,7 +141,7 @@ import pathlib, sys, time
 class Stuck:
     def find_spec(self, name, path=None, target=None):
         if name in ("numpy", "typer") and "--multiprocessing-fork" in sys.orig_argv:
-            pathlib.Path("begun").touch()
+            pathlib.Path(__file__).with_name("begun").touch()
             time.sleep(600.0)
 
 sys.meta_path.insert(0, Stuck())
@@ -151,10 +151,8 @@ sys.meta_path.insert(0, Stuck())
 @pytest.mark.slow
 def test_a_guard_that_has_not_yet_imported_anything_large_ends_with_a_killed_command(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(STUCK)
-    environment = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{tmp_path}", "STUCK": str(tmp_path)}
-    command = [sys.executable, "-m", "servobench", "compare", "--plants", "kinematic", "--controllers", "constant",
-               "--workers", "2", "--out", "out"]  # fmt: skip
-    with subprocess.Popen(command, env=environment, cwd=tmp_path) as process:
+    words = ("compare", "--plants", "kinematic", "--controllers", "constant", "--workers", "2")
+    with start(*words, "--out", str(tmp_path / "out"), path=tmp_path, STUCK=str(tmp_path)) as process:
         wait_for((tmp_path / "begun").exists)
         process.kill()
     wait_for(lambda: not left_behind("STUCK", str(tmp_path)), 5.0)

@@ -1,36 +1,30 @@
 """Runs under sensing set-ups: units, tasks, views, pose errors, and what is refused."""
 
-import hashlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import servobench
 from kit.lanes import assert_rows_of_single_runs
 from kit.own import write
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
-from servobench.harness.batch.manifest import describe_sensing, named_files
-from servobench.harness.batch.plan import Survey
+from servobench.harness.batch.manifest import describe_sensing
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.outcome import pose_error
-from servobench.harness.run.references import FollowedCurve
-from servobench.harness.run.request import RunRequest, find_sensing, sensing_names
+from servobench.harness.run.request import RunRequest, find_sensing
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
-from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.inverse import closest_distance, reach_pose
+from servobench.plant.robot.inverse import reach_pose
 
 PIXEL_WORDS = ["pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand"]
 
@@ -76,7 +70,6 @@ def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the
     for word in ("pixel", "pixel:hand", "plate"):
         model = find_sensing(word).nominal(robot)
         plant = entry.build(entry.config(), PlantSetup(model, robot.workspace.home, 0.05, robot))
-        assert isinstance(plant, Bench)
         still, seen = Command(np.zeros(6)), []
         plant.reset(0)
         for _ in range(1000):
@@ -92,10 +85,12 @@ def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the
 def test_starts_and_targets_are_in_view_and_taught_on_the_true_robot(word, seed):
     run = drawn(word, "random", seed)
     model, reference = run.true, run.scenario.reference
-    assert isinstance(model, SetupModel)
     assert model.valid(run.scenario.start).all()
     assert model.valid_at(reference.points(0.0)).all()
     np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.joint_position))
+    if ":hand" in word and "plate" not in word:  # where a fixed circle might leave the view
+        curve = drawn(word, "circle", seed)
+        assert curve.true.valid_at(curve.scenario.reference.points(np.linspace(0.0, 10.0, 16))).all()
 
 
 @pytest.mark.parametrize("word", ["pixel", "stereo"])
@@ -113,28 +108,16 @@ def test_curves_are_the_image_of_the_ball_on_the_curve_of_position(word, task):
 
 
 def test_a_circle_of_a_plate_keeps_its_orientation_and_is_in_reach_of_the_arm():
-    run, robot = drawn("plate", "circle"), find_robot("ur5")
-    reference, model = run.scenario.reference, run.true
-    assert isinstance(reference, FollowedCurve)
-    home, limit = model.points(robot.workspace.home), np.full(6, 2 * np.pi)
-    q = robot.workspace.home
+    run, q = drawn("plate", "circle"), find_robot("ur5").workspace.home
+    model, limit = run.true, np.full(6, 2 * np.pi)
+    home, start = model.points(q), model.arm.frames(q)[-1]
     for time in np.linspace(0.0, 10.0, 21):
-        points = reference.points(time)
-        distance, angle = pose_error(home, points)
-        assert angle == pytest.approx(0.0, abs=1e-6)
-        assert distance < 0.3
-        pose = model.arm.frames(robot.workspace.home)[-1].copy()
+        points, pose = run.scenario.reference.points(time), start.copy()
+        assert pose_error(home, points)[1] == pytest.approx(0.0, abs=1e-6)
         pose[:3, 3] += points.mean(axis=0) - home.mean(axis=0)
         q, left = reach_pose(model.arm, pose, q, -limit, limit)
         assert left < 1e-6
         np.testing.assert_allclose(model.points(q), points, atol=1e-5)
-
-
-@pytest.mark.parametrize("word", ["pixel:hand", "stereo:hand"])
-def test_a_circle_before_the_hand_is_in_view(word):
-    run = drawn(word, "circle", 1)
-    model, times = run.true, np.linspace(0.0, 10.0, 16)
-    assert model.valid_at(run.scenario.reference.points(times)).all()
 
 
 @pytest.mark.parametrize("word", ["plate", "plate:hand"])
@@ -159,19 +142,11 @@ def test_the_canonical_tasks_displace_the_target_before_the_camera_as_they_say(w
         np.testing.assert_allclose(away.mean(axis=0)[2], 0.75 * home.mean(axis=0)[2], rtol=1e-5)
 
 
-def test_a_pose_is_reached_or_not_by_the_length_of_the_arm():
-    robot = find_robot("ur5")
-    rng, limit = np.random.default_rng(0), np.full(6, 2 * np.pi)
-    for _ in range(10):
-        q = rng.uniform(robot.workspace.lower, robot.workspace.upper)
-        pose = robot.arm.frames(q)[-1]
-        found, left = reach_pose(robot.arm, pose, q + 0.2 * rng.standard_normal(6), -limit, limit)
-        assert left < 1e-8
-        np.testing.assert_allclose(robot.arm.frames(found)[-1], pose, atol=1e-8)
+def test_a_pose_beyond_the_length_of_the_arm_is_not_reached():
+    robot, limit = find_robot("ur5"), np.full(6, 2 * np.pi)
     far = robot.arm.frames(robot.workspace.home)[-1].copy()
     far[:3, 3] = 3.0
     assert reach_pose(robot.arm, far, robot.workspace.home, -limit, limit)[1] > 0.1
-    assert closest_distance(robot.arm, far[:3, 3], -limit, limit) > 1.0
 
 
 def test_the_pose_error_is_the_motion_between_two_places():
@@ -190,7 +165,6 @@ def test_the_pose_error_is_the_motion_between_two_places():
 
 def test_a_run_of_a_plate_has_its_true_pose_error_in_both_tables():
     result = run_experiment(request("plate", "plane_turn"), Settings({}))
-    assert result.steps is not None
     assert {"pose_error_mm", "pose_error_deg", "true_feature_u3_px"} <= set(result.steps)
     assert result.steps["pose_error_deg"].iloc[0] == pytest.approx(30.0, abs=12.0)  # the true arm is another one
     assert result.row["pose_error_deg"] == pytest.approx(result.steps["pose_error_deg"].iloc[-20:].mean())
@@ -257,25 +231,18 @@ FROM_THE_SIDE = SensingSetup("side", "distance from a pole", ("r", "y", "z"), "m
 
 def test_a_file_can_bring_a_set_up(tmp_path):
     file = write(tmp_path, OWN, "side.py")
-    row = run_experiment(request(f"{file}:hand"), Settings({})).row
-    assert row["outcome"] == "settled"
-    assert row["sensing"] == f"{file}:hand"
     word = f"{file}:hand"
+    row = run_experiment(request(word), Settings({})).row
+    assert (row["outcome"], row["sensing"]) == ("settled", word)
     assert describe_sensing(word) == {"name": word, "features": ["r", "y", "z"], "unit": "m", "cameras": 1}
-    files = named_files(Survey(sensings={word: None, "stereo:hand": None}), {}, ())
-    assert files == {str(file): hashlib.sha256(OWN.encode()).hexdigest()}
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")
-    axis_first = OWN.replace("axis=-1", "axis=0")
-    assert axis_first != OWN
-    file.write_text(axis_first)
-    with pytest.raises(
-        ConfigurationError, match=r"side.py: measure must return 3 features along .*, got the shape \(3, 2\)"
-    ):
+    file.write_text(OWN.replace("axis=-1", "axis=0"))
+    wanted = r"side.py: measure must return 3 features along .*, got the shape \(3, 2\)"
+    with pytest.raises(ConfigurationError, match=wanted):
         run_experiment(request(str(file)), Settings({}))
-    (tmp_path / "none.py").write_text("x = 1\n")
     with pytest.raises(ConfigurationError, match="defines no sensing set-up"):
-        find_sensing(str(tmp_path / "none.py"))
+        find_sensing(str(write(tmp_path, "x = 1\n", "none.py")))
 
 
 def test_networks_are_trained_on_the_features_of_a_set_up():
@@ -288,16 +255,9 @@ def test_networks_are_trained_on_the_features_of_a_set_up():
     assert (by_metres.jacobian.m, by_pixels.jacobian.m) == (3, 2)
 
 
-def test_names_of_all_set_ups_are_found():
-    assert [str(find_sensing(word)) for word in sensing_names()] == sensing_names()
-
-
 @pytest.mark.parametrize(("robot", "sensing"), [("ur10e", "pixel"), ("panda", "pixel:hand")])
 def test_noise_in_pixels_is_logged_in_pixels(robot, sensing):
-    noise = {"kinematic": {"sensing": {"feature_noise": "2px"}, "command_delay": 0.0}, "circle": {"laps": 10}}
-    steps = servobench.run(
-        "constant", task="circle", robot=robot, sensing=sensing, mismatch="none", settings=noise
-    ).steps
+    noise = Settings({"kinematic": {"sensing": {"feature_noise": "2px"}}, "circle": {"laps": 4}})
+    steps = run_experiment(request(sensing, "circle", "constant", robot=robot), noise).steps
     apart = np.concatenate([steps[f"feature_{each}_px"] - steps[f"true_feature_{each}_px"] for each in "uv"])
-    assert len(apart) > 3000
-    assert apart.std() == pytest.approx(2.0, abs=0.1)
+    assert apart.std() == pytest.approx(2.0, abs=0.15)

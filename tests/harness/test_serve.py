@@ -41,15 +41,7 @@ def test_a_move_takes_the_time_of_a_trapezoid():
     assert done(duration / 2.0) == pytest.approx(0.5)
     assert done(0.1) == pytest.approx(1.4 * 0.1**2 / 2.0 / 0.5)
     assert [done(0.0), done(-1.0), done(duration), done(9.0)] == [0.0, 0.0, 1.0, 1.0]
-
-
-def test_a_short_move_never_reaches_its_speed():
-    duration, done = profile(0.1, 5.0, 1.0)
-    assert duration == pytest.approx(2.0 * math.sqrt(0.1))
-    assert np.gradient([done(t) for t in np.linspace(0.0, duration, 101)], duration / 100).max() * 0.1 < 0.32
-
-
-def test_no_move_takes_no_time():
+    assert profile(0.1, 5.0, 1.0)[0] == pytest.approx(2.0 * math.sqrt(0.1))  # never reaches its speed
     assert profile(0.0, 1.0, 1.0)[0] == 0.0
 
 
@@ -209,28 +201,21 @@ def test_the_watchdog_ends_the_program_after_its_time_and_a_kick_holds_it_off(sp
     assert lines == ["control program ended by its watchdog, after 0.102 s without a command"]
 
 
-def moving_program(spec):
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_program_that_ends_or_replaces_one_that_moves_stops_the_arm(spec, replaced):
     program = program_of(spec, [], lockstep=False)
     program.inputs |= registers(9, *[1.0] * 6, 100.0)
     program.cycle()
     for _ in range(20):
         program.advance()
-    return program
-
-
-def test_a_program_that_ended_stops_the_arm_within_its_deceleration(spec):
-    program = moving_program(spec)
-    program.stop("for a test")
-    assert np.abs([program.advance() for _ in range(50)][-1]).max() == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_program_that_replaces_one_that_moves_begins_with_a_stop(spec):
-    program = moving_program(spec)
-    program.inputs |= registers(0)
-    program.begin()
-    program.cycle()
-    assert np.abs([program.advance() for _ in range(60)][-1]).max() == 0.0
-    assert program.running
+    if replaced:
+        program.inputs |= registers(0)
+        program.begin()
+        program.cycle()
+    else:
+        program.stop("for a test")
+    assert np.abs([program.advance() for _ in range(60)][-1]).max() == pytest.approx(0.0, abs=1e-12)
+    assert program.running == replaced
 
 
 def test_a_protective_stop_can_be_unlocked_after_five_seconds_and_not_before(spec, monkeypatch):
@@ -243,7 +228,6 @@ def test_a_protective_stop_can_be_unlocked_after_five_seconds_and_not_before(spe
     assert not program.unlock()
     now[0] += 0.2
     assert program.unlock()
-    assert program.stopped_at is None
 
 
 def test_a_second_client_that_commands_is_refused_by_either_register(lockstep):

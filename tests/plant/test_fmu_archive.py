@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from servobench.plant.contract import checksums
 from servobench.plant.contract.cache import cache_folder
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
@@ -129,3 +130,18 @@ def test_a_link_in_an_archive_is_not_followed(tmp_path):
 )
 def test_a_description_that_makes_no_sense_is_one_line(description, message, tmp_path):
     assert message in refused(pack(tmp_path / "crane.fmu", {}, description))
+
+
+def test_cuts_and_flips_of_an_archive_are_read_or_refused_in_one_line(tmp_path):
+    content = pack(tmp_path / "good.fmu", {"binaries/linux64/crane.so": bytes(range(256))}).read_bytes()
+    path, refusals = tmp_path / "bad.fmu", []
+    for place in range(0, len(content), 37):
+        for bad in (content[:place], content[:place] + bytes([content[place] ^ 0x15]) + content[place + 1 :]):
+            path.write_bytes(bad)
+            checksums._digest.cache_clear()
+            try:
+                extract_fmu(path)
+            except ValueError as error:
+                refusals.append(str(error))
+    assert len(refusals) > 20
+    assert [each for each in refusals if "\n" in each or not each.startswith(f"fmu file {path} ")] == []
