@@ -28,7 +28,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
-from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.twin import CAMERA, LENS, ball_rates, deviated, parameter_names
 
@@ -45,6 +45,7 @@ PRIORS: Final = {  # standard deviations by the begin of a parameter's name
 }  # fmt: skip
 EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compliance", "turning")
 """Parameters of gears, clocks, tool and mounting; pixels do not tell the last two."""
+EXPOSURE: Final = ("latency", *EXTRAS[:5])  # which joints a frame shows
 ARM: Final = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
@@ -57,6 +58,7 @@ TOLD: Final = 1.2  # [1] growth of a deviation with a prior of twice the width, 
 TOLD_SHARE: Final = 0.5  # [1] of its prior deviation, below which a direction is drawn from
 OUTLIER: Final = 16.0  # [1] squared Mahalanobis distance of an outlier
 FITS: Final = 4
+ROWS_AT_ONCE: Final = 2**14  # of logs that are placed before a camera side by side
 STEP: Final = 1e-6  # [1] of differences, in prior deviations
 MAX_LAGS: Final = 100  # [frames] of the correlation time
 
@@ -176,20 +178,23 @@ class _Problem:
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model, self.pace, model = model, 1.0, deviated(model, begin)
-        tried = [self._placed(model, latency, 0.0) for latency in np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)]
+        latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
+        self.spread, latency, turning, pose = self._placed(model, latencies, np.zeros_like(latencies))
         if not pixels:
-            tried += [self._placed(model, min(tried)[1], turning) for turning in TURNINGS]
-        self.spread, latency, turning, pose = min(tried)
+            self.spread, _, turning, pose = self._placed(model, np.full(len(TURNINGS), latency), TURNINGS)
         found = {**begin, "latency": latency, "turning": turning}
         self.z = np.array([found.get(name, 0.0) for name in self.names]) / self.scale * ~self._of_camera
-        self.model = self.model.with_camera(np.array(pose))
+        self.model = self.model.with_camera(pose)
 
-    def _placed(self, model: RobotModel, latency: float, turning: float) -> tuple[float, float, float, Any]:
-        """Return the median error at a latency and a speed of turning, both, and the pose that fits best."""
-        q = self.motion(self.time - latency)
-        y = turned(self.y, -turning * (self.time - latency)) if turning else self.y
-        pose, error = fit_camera(model, q, y)
-        return error, float(latency), float(turning), pose.tolist()
+    def _placed(
+        self, model: RobotModel, latencies: FloatArray, turnings: FloatArray
+    ) -> tuple[float, float, float, FloatArray]:
+        """Return of some latencies and speeds of turning those with the least median error: it, both and the pose."""
+        exposed = self.time - latencies[:, None]
+        y = turned(self.y, -turnings[:, None] * exposed) if turnings.any() else self.y
+        poses, errors = fit_cameras(model, self.motion(exposed), y)
+        best = int(errors.argmin())
+        return float(errors[best]), float(latencies[best]), float(turnings[best]), poses[best]
 
     def values(self, z: FloatArray) -> dict[str, float]:
         """Return θ by name."""
@@ -198,16 +203,16 @@ class _Problem:
     def _exposed(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Return when the frames were exposed, (k,) s, and the joints behind their gears then, (k, n) rad."""
         steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
-        for _ in range(8):  # the swing is that at the exposure
+        for _ in range(8 if values["swing_sin"] or values["swing_cos"] else 0):  # the swing is that at the exposure
             phase = self.pace * time
             time = steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
         q = transmitted(self.motion(time), values["ripple"], RIPPLE_ORDER)
         return time, q + values["backlash"] * self.play(time)
 
-    def _seen(self, values: Mapping[str, float], time: FloatArray, ball: FloatArray) -> FloatArray:
-        """Return h, (k, m), for the ball in the base frame, (k, 3) m, where a rigid tool holds it."""
-        model: Any = deviated(self.model, values)
-        y = model.feature_at(ball[:, None]) if isinstance(model, SetupModel) else model.to_camera(ball)
+    def _seen(self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray) -> FloatArray:
+        """Return h, (k, m), by the camera of a model for the ball in the base frame, (k, 3) m, of a rigid tool."""
+        own: Any = model
+        y = own.feature_at(ball[:, None]) if isinstance(model, SetupModel) else own.to_camera(ball)
         if "turning" in values:
             y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
         return np.asarray(y)
@@ -215,24 +220,30 @@ class _Problem:
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
         values = self.values(z)
-        time, q = self._exposed(values)
-        return np.asarray(self.y - self._seen(values, time, deviated(self.model, values).arm.ball_position(q)))
+        (time, q), model = self._exposed(values), deviated(self.model, values)
+        return np.asarray(self.y - self._seen(model, values, time, model.arm.ball_position(q)))
 
     def jacobian(self, z: FloatArray) -> FloatArray:
-        """Return ∂(y − h)/∂z, (p, k, m): of the arm by the chain rule, of other parameters by differences."""
+        """Return ∂(y − h)/∂z, (p, k, m): of arm and camera by the chain rule, of others by differences."""
         values = self.values(z)
-        time, q = self._exposed(values)
+        (time, q), model = self._exposed(values), deviated(self.model, values)
         ball, motions = ball_rates(self.model, values, q)
         by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
-        seen = self._seen(values, time, ball)
-        rates: dict[str, FloatArray] = {}
+        seen = self._seen(model, values, time, ball)
+        # A turned or moved camera sees what the other one would of a ball that moves the other way.
+        pose, turn, steps = model.camera, [values[name] for name in CAMERA[:3]], STEP * np.eye(3)
+        back, lever = pose[:3, :3] @ (self.model.camera[:3, :3] @ rotation_matrix(turn + steps)).mT, ball - pose[:3, 3]
+        motions |= dict(zip(CAMERA, (*(lever @ back.mT - lever) / STEP, *-np.eye(3)), strict=True))
+        by_ball = np.stack([self._seen(model, values, time, ball + each) - seen for each in steps], axis=-1) / STEP
+        rates = {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
         for name in set(self.names) - set(motions):
-            other = {**values, name: values[name] + STEP * prior(name)}
-            then, joints = self._exposed(other)
-            rates[name] = (self._seen(other, then, ball + np.matvec(by_joint, joints - q)) - seen) / STEP
-        # A motion of the ball acts as the opposite one of the camera.
-        by_ball = -np.stack([rates[name] / prior(name) for name in CAMERA[3:]], axis=-1)
-        rates |= {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
+            other, eye, then, place = {**values, name: values[name] + STEP * prior(name)}, model, time, ball
+            if name in LENS:
+                eye = self.model.with_camera(pose).with_lens(np.array([other[each] for each in LENS]))
+            elif name in EXPOSURE:
+                then, joints = self._exposed(other)
+                place = ball + np.matvec(by_joint, joints - q)
+            rates[name] = (self._seen(eye, other, then, place) - seen) / STEP
         return -np.stack([rates[name] for name in self.names])
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
@@ -284,9 +295,9 @@ class _Problem:
 
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return places (k, 3) as a camera sees them that is turned about its optical axis by angles (k,) [rad]."""
+    """Return places (k, 3) as cameras see them that are turned about their optical axes by angles (..., k) [rad]."""
     (x, y, z), c, s = places.T, np.cos(angle), np.sin(angle)
-    return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
+    return np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1)
 
 
 def played(joints: FloatArray, size: float) -> FloatArray:
@@ -296,37 +307,53 @@ def played(joints: FloatArray, size: float) -> FloatArray:
     return behind - joints
 
 
-def fit_camera(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, float]:
-    """Return the robust pose of a fixed camera, (4, 4), and the median of its errors [unit of the feature].
+def fit_cameras(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return robust poses of a fixed camera, (s, 4, 4), and the median of the errors of each [unit of the feature].
 
     Args:
         model: nominal robot with one camera.
-        joints: (k, n) [rad].
-        features: (k, 3) m, places of the ball, or (k, 2) px, its pixels.
+        joints: of s logs, (s, k, n) [rad].
+        features: (s, k, 3) m, places of the ball, or (s, k, 2) px, its pixels; without s the same for all.
     """
-    pose = np.eye(4)
-    if isinstance(model, SetupModel) and model.setup.name == PIXEL.name:
-        import cv2  # noqa: PLC0415 - a tenth of a second
+    features = np.broadcast_to(features, (*joints.shape[:2], features.shape[-1]))
+    pixels = isinstance(model, SetupModel) and model.setup.name == PIXEL.name
+    most = max(1, ROWS_AT_ONCE // joints.shape[1])
+    fit: Any = _by_pixels if pixels else _by_places
+    starts = range(0, len(joints), most)
+    poses, errors = zip(*(fit(model, joints[k : k + most], features[k : k + most]) for k in starts), strict=True)
+    return np.concatenate(poses), np.concatenate(errors)
 
-        matrix = np.eye(3)
-        matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
-        points = np.ascontiguousarray(model.points(joints)[:, 0])
-        found, turn, place, _ = cv2.solvePnPRansac(points, features.copy(), matrix, None, reprojectionError=20.0)
+
+def _by_pixels(model: SetupModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+    import cv2  # noqa: PLC0415 - a tenth of a second
+
+    matrix, poses, errors = np.eye(3), np.tile(np.eye(4), (len(joints), 1, 1)), np.zeros(len(joints))
+    matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
+    for k, (q, y) in enumerate(zip(joints, features, strict=True)):
+        points = np.ascontiguousarray(model.points(q)[:, 0])
+        found, turn, place, _ = cv2.solvePnPRansac(points, y.copy(), matrix, None, reprojectionError=20.0)
         if found:
-            pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
-        pose[:] = np.linalg.inv(pose) if found else model.camera
-        return pose, float(np.median(np.linalg.norm(model.with_camera(pose).feature(joints) - features, axis=1)))
-    points, weights = model.arm.ball_position(joints), np.ones(len(joints))
+            poses[k, :3, :3], poses[k, :3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
+        poses[k] = np.linalg.inv(poses[k]) if found else model.camera
+        errors[k] = np.median(np.linalg.norm(model.with_camera(poses[k]).feature(q) - y, axis=1))
+    return poses, errors
+
+
+def _by_places(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
+    points, poses = model.arm.ball_position(joints), np.tile(np.eye(4), (len(joints), 1, 1))
+    weights, unit = np.ones(points.shape[:2]), np.ones((len(joints), 3))
     for _ in range(5):  # Kabsch's rotation with the weights of Weiszfeld's median
-        share = weights / weights.sum()
+        share = (weights / weights.sum(axis=1, keepdims=True))[:, None]
         middle, mean = share @ points, share @ features
-        U, _, V = np.linalg.svd((points - middle).T @ ((features - mean) * share[:, None]))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-        pose[:3, :3], pose[:3, 3] = R, middle - R @ mean
-        distance = np.linalg.norm(features - (points - pose[:3, 3]) @ R, axis=1)
-        error = float(np.median(distance))
-        weights = 1.0 / np.maximum(distance, error + 1e-9)
-    return pose, error
+        U, _, V = np.linalg.svd((points - middle).mT @ ((features - mean) * share.mT))
+        unit[:, 2] = np.linalg.det(U @ V)
+        R = U * unit[:, None] @ V
+        place = middle - mean @ R.mT
+        distance = np.linalg.norm(features - (points - place) @ R, axis=2)
+        errors = np.median(distance, axis=1)
+        weights = 1.0 / np.maximum(distance, errors[:, None] + 1e-9)
+    poses[:, :3, :3], poses[:, :3, 3] = R, place[:, 0]
+    return poses, errors
 
 
 def identify(

@@ -7,12 +7,12 @@ each mistake is undone in turn, then each pair, and named where the log is expla
 import math
 from collections.abc import Iterator, Mapping
 from heapq import nsmallest
-from itertools import combinations, islice, product
+from itertools import combinations, count, groupby, islice
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, fit_camera, frames_of, identify
+from servobench.harness.run.identification import MIN_FRAMES, OUTLIER, Identified, Log, fit_cameras, frames_of, identify
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -26,6 +26,7 @@ GAIN: Final = 0.8  # [1] of the misfit, below which undoing a mistake explains a
 PAIR_GAIN: Final = 0.5  # [1] of what one mistake leaves, below which two explain it
 TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell two mistakes apart
 SCREENED: Final = 6  # mistakes that are looked at closely
+AT_ONCE: Final = 64  # logs without a mistake that are placed before a camera side by side
 FRAMES: Final = 150  # frames of a close look
 DRIFT: Final = 10.0  # [ms] over the log, from which a clock counts as drifting
 CERTAIN: Final = 6.0  # [1] standard deviations
@@ -97,20 +98,22 @@ def _shares(log: Log, robot: Identified) -> FloatArray:
 
 def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
     """Return zeros of the joints, by a search along one after the other with the camera where it fits."""
-    rows, draws = frames_of(log, FRAMES // 3), np.random.default_rng(0)
-    q, y, n = log.joints[rows], log.features[rows], log.spec.n
-    found: list[tuple[float, list[float]]] = []
-    for _ in range(SEARCHES):
-        best, zeros, before = np.inf, draws.uniform(-math.pi, math.pi, n), np.inf
-        while best < before or before == np.inf:
-            before = best
-            for joint, angle in product(range(1, n - 1), ANGLES):  # the first and the last one turn camera and ball
-                other = np.where(np.arange(n) == joint, (zeros + angle) % (2.0 * math.pi), zeros)
-                _, error = fit_camera(model, q + other, y)
-                if error < best:
-                    best, zeros = error, other
-        found.append((best, ((zeros + math.pi) % (2.0 * math.pi) - math.pi).tolist()))
-    return {f"zero_{name}": zero for name, zero in zip(log.spec.joint_names, min(found)[1], strict=True)}
+    rows, draws, n = frames_of(log, FRAMES // 3), np.random.default_rng(0), log.spec.n
+    q, y = log.joints[rows], log.features[rows]
+    zeros, errors = draws.uniform(-math.pi, math.pi, (SEARCHES, n)), np.full(SEARCHES, np.inf)
+    left = np.arange(SEARCHES)
+    while left.size:
+        before = errors[left]
+        for joint in range(1, n - 1):  # the first and the last one turn camera and ball
+            tried = np.repeat(zeros[left, None], len(ANGLES), axis=1)
+            tried[..., joint] += ANGLES
+            _, found = fit_cameras(model, q + tried.reshape(-1, 1, n), y)
+            found = found.reshape(len(left), -1)
+            best, less = found.argmin(axis=1), found.min(axis=1) < errors[left]
+            zeros[left[less]], errors[left[less]] = tried[less, best[less]], found[less, best[less]]
+        left = left[errors[left] < before]
+    zero = (zeros[errors.argmin()] + math.pi) % (2.0 * math.pi) - math.pi
+    return {f"zero_{name}": each for name, each in zip(log.spec.joint_names, zero.tolist(), strict=True)}
 
 
 def _units(log: Log, model: RobotModel) -> str:
@@ -203,9 +206,6 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
     rows = frames_of(log, FRAMES)
     noise = np.maximum(noise_of(log), 2e-3 * _spread(log.features[rows]).max())
 
-    def quick(each: _Remedy) -> float:
-        return fit_camera(each.model, each.log.joints[rows], each.log.features[rows])[1]
-
     def misfit(each: _Remedy, begin: Mapping[str, float] | None = None) -> float:
         robot = identify(each.log, each.model, FRAMES, fits=2, begin=begin)
         if known and begin is None and robot.unlikely():
@@ -217,8 +217,8 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
     names: list[str] = []
     stages = ((_remedies, TIE),) if known else ((_remedies, GAIN), (_pairs, PAIR_GAIN))
     for remedies, gain in stages:
-        tried = nsmallest(SCREENED, remedies(log, model, others), key=quick)
-        found = sorted((misfit(each), each.text) for each in tried)
+        tried = nsmallest(SCREENED, _placed(remedies(log, model, others), rows))
+        found = sorted((misfit(each), each.text) for *_, each in tried)
         if found[0][0] < gain * least:
             least = found[0][0]
             names = [text for own, text in found if own <= TIE * least]
@@ -228,6 +228,18 @@ def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known
         return ""
     which = "; a log cannot tell which" if len(names) > 1 else ""
     return f"{', or '.join(names)} (undone, {math.sqrt(least / max(least, as_it_is)):.0%} of the error is left{which})"
+
+
+def _placed(remedies: Iterator[_Remedy], rows: FloatArray) -> Iterator[tuple[float, int, _Remedy]]:
+    """Yield the error of some rows of each log before a camera where it fits, a number that counts up, and the log."""
+    numbers = count()
+    while part := list(islice(remedies, AT_ONCE)):
+        for _, same in groupby(part, key=lambda each: id(each.model)):
+            group = list(same)
+            joints = np.stack([each.log.joints[rows] for each in group])
+            features = np.stack([each.log.features[rows] for each in group])
+            _, errors = fit_cameras(group[0].model, joints, features)
+            yield from zip(errors.tolist(), numbers, group, strict=False)
 
 
 def _pairs(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:

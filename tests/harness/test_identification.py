@@ -16,7 +16,7 @@ from servobench.harness.run.identification import (
     _Problem,
     command_response,
     correlation_time,
-    fit_camera,
+    fit_cameras,
     identify,
     joint_steps,
     read_log,
@@ -141,9 +141,9 @@ def test_poses_of_cameras_are_found_among_outliers():
         wanted = model.turned(np.array([0.1, -0.2, 0.7]), (0.4, 0.1, 0.4))
         y = np.array(wanted.feature(q))
         y[rng.random(len(y)) < 0.2] += 50.0 if sensing == "pixel" else 0.3
-        pose, error = fit_camera(model, q, y)
-        np.testing.assert_allclose(pose, wanted.camera, atol=2e-3)
-        assert error < 2e-3 * log.spec.feature.scale
+        poses, errors = fit_cameras(model, np.stack([q, q[:, ::-1]]), y)
+        np.testing.assert_allclose(poses[0], wanted.camera, atol=2e-3)
+        assert errors[0] < 2e-3 * log.spec.feature.scale < 0.1 * errors[1]
 
 
 @pytest.mark.parametrize("sensing", ["position", "pixel"])
