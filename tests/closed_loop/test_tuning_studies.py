@@ -121,7 +121,7 @@ def test_a_campaign_taken_up_again_is_that_which_was_never_interrupted(made_up, 
     for name in part.controllers:
         with (tmp_path / "parts" / f"{name}.jsonl").open("ab") as ledger:
             ledger.write(b'{"settings": {"law": {"cut')
-    assert outcomes(tmp_path / "parts", part) == whole
+    assert repr(outcomes(tmp_path / "parts", part)) == repr(whole)  # which hold NaN
     assert len(made_up) <= 2 * once + 1  # at most the point that was under way is scored twice
 
 
@@ -130,7 +130,7 @@ def test_each_study_has_a_sampler_of_its_own_that_the_seed_decides(made_up, tmp_
     (method,) = carried_out(tmp_path / "a", plan_of("rls", trials=trials, studies=2))
     assert len(method.ledger) == trials + 3
     second = outcomes(tmp_path / "b", plan_of("rls", trials=trials, study_seed=1))[0]
-    assert second == [method.studies[1].outcome]
+    assert repr(second) == repr([method.studies[1].outcome])  # which holds NaN
 
 
 def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_out(made_up, tmp_path):
