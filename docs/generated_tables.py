@@ -67,8 +67,6 @@ PART = re.compile(
     re.DOTALL,
 )
 RELEASED = False  # whether a release is on a package index, from which all pages then install
-NEW_LINE = "\n"
-LINE = 120  # letters
 SETTING = ("setting [unit]", "default", "meaning")
 
 
@@ -287,68 +285,39 @@ def attributes(kind: type[Any]) -> dict[str, str]:
 
 
 def interface(names: list[str]) -> str:
-    """Return signatures and docstrings as Python, of `CLASS(*)` those of its methods, of another class its fields."""
+    """Return the source of definitions with their docstrings, of `CLASS(*)` with its methods, of a class its fields."""
     parts = []
     for name in names:
         place, _, word = name.removesuffix("(*)").rpartition(".")
         thing = getattr(importlib.import_module(place), word)
-        lines, inner = [documented(defined(thing), inspect.getdoc(thing))], []
+        source, signature, node = definition(thing)
+        text = node.body[0]
+        lines = [*signature, *source.splitlines()[text.lineno - 1 : text.end_lineno]]
         if name.endswith("(*)"):
             methods = (each for key, each in vars(thing).items() if inspect.isfunction(each) and key[0] != "_")
-            inner = [f"{documented(defined(each), inspect.getdoc(each).partition(NEW_LINE)[0])}\n" for each in methods]
+            lines += [textwrap.indent(f"\n{in_brief(each)}", "    ") for each in methods]
         elif isinstance(thing, type):
-            inner = written_arguments(thing)
-        whole = "\n".join([*lines, "", textwrap.indent("\n".join(inner), "    ")])
-        parts.append(f"```python\n{whole.rstrip()}\n```")
+            fields = (each for each in node.body if isinstance(each, ast.AnnAssign))
+            lines += ["", *(f"    {ast.get_source_segment(source, each)}" for each in fields)]
+        parts.append("```python\n" + "\n".join(lines) + "\n```")
     return "\n\n".join(parts)
 
 
-def defined(thing: Any) -> str:  # noqa: ANN401 - a function or a class
-    """Return the line, or lines, that begin the definition of a function or a class."""
-    if isinstance(thing, type):
-        return f"class {thing.__name__}:"
-    found = written_signature(thing)
-    line = f"def {thing.__name__}{unquoted(str(found))}:"
-    if len(line) <= LINE:
-        return line
-    end = line[line.rindex(") -> ") :]
-    arguments = written_arguments(thing)
-    by_name = [each.kind is each.KEYWORD_ONLY for each in found.parameters.values()]
-    if any(by_name):
-        arguments.insert(by_name.index(True), "*")
-    together = f"    {', '.join(arguments)}"
-    lines = [together] if len(together) <= LINE else [f"    {each}," for each in arguments]
-    return "\n".join([f"def {thing.__name__}(", *lines, end])
+def definition(thing: Any) -> tuple[str, list[str], Any]:  # noqa: ANN401 - a function or a class
+    """Return the source of a function or a class, the lines before its docstring, and its node in the syntax tree.
+
+    In these lines comments are left out, and a named constant is replaced by its value.
+    """
+    source = textwrap.dedent(inspect.getsource(thing))
+    node: Any = ast.parse(source).body[0]
+    constants = vars(sys.modules[thing.__module__])
+    lines = (line.partition("  # ")[0] for line in source.splitlines()[node.lineno - 1 : node.body[0].lineno - 1])
+    return source, [re.sub(r"\b[A-Z]+_[A-Z_]+\b", lambda word: toml(constants[word[0]]), line) for line in lines], node
 
 
-def written_signature(thing: Any) -> inspect.Signature:  # noqa: ANN401 - a function or a class
-    """Return the signature with annotations as the source has them, whether or not Python evaluates them."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
-    found, texts = inspect.signature(thing), dict[str, str]()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.AnnAssign | ast.arg) and node.annotation:
-            name = node.arg if isinstance(node, ast.arg) else ast.unparse(node.target)
-            texts.setdefault(name, ast.unparse(node.annotation))
-    returned = getattr(tree.body[0], "returns", None)
-    arguments = [each.replace(annotation=texts.get(name, each.annotation)) for name, each in found.parameters.items()]
-    result = ast.unparse(returned) if returned else found.return_annotation
-    return found.replace(parameters=arguments, return_annotation=result)
-
-
-def written_arguments(thing: Any) -> list[str]:  # noqa: ANN401 - a function or a class
-    """Return the arguments of a function, or of the constructor of a class, as Python."""
-    return [unquoted(str(each)) for each in written_signature(thing).parameters.values()]
-
-
-def unquoted(signature: str) -> str:
-    """Return a signature whose annotations are no texts, with `...` for a default that is an object."""
-    signature = re.sub(r"= <(?:[^<>]|<\w+>)*>", "= ...", signature)
-    return re.sub(r"(: |-> )'([^'=]*)'", r"\1\2", signature).replace("'", '"')
-
-
-def documented(line: str, text: str) -> str:
-    """Return the beginning of a definition with its docstring."""
-    return f"{line}\n" + textwrap.indent(f'"""{text}{NEW_LINE * (NEW_LINE in text)}"""', "    ")
+def in_brief(method: Any) -> str:  # noqa: ANN401 - a function
+    """Return the signature of a method with the first line of its docstring."""
+    return "\n".join([*definition(method)[1], f'    """{inspect.getdoc(method).splitlines()[0]}"""'])
 
 
 def metrics_table() -> str:
