@@ -338,6 +338,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
+    _many: Experiment | None = None  # the runs; an object whose choice is refused is closed, too
 
     def __init__(self, num_envs: int = 1, **choice: Any) -> None:  # noqa: ANN401 - typed by `ServoEnv`
         """Look everything up.
@@ -366,7 +367,6 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._many: Experiment | None = None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
