@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 RUNS ?= results/pages
 NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
-.PHONY: run check test results nightly golden lint format tables docs release benchmark lock clean
+.PHONY: run check test lowest results nightly golden lint format tables docs release benchmark lock clean
 
 # The first table within a minute, and then runs on rendered images with a report; its path is the last line.
 COMPARE := $(BIN)/servobench compare \
@@ -21,6 +21,13 @@ check: lint
 # For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
 	$(BIN)/python -m pytest -n auto --dist loadgroup
+
+# The quick tests with the least versions that pyproject.toml allows, in an environment of its own.
+lowest:
+	$(PYTHON) -m venv build/lowest
+	build/lowest/bin/python -m pip install --quiet uv
+	build/lowest/bin/uv pip install --quiet --python build/lowest/bin/python --resolution lowest-direct --editable ".[dev]"
+	build/lowest/bin/python -m pytest -n auto --dist loadgroup -m "not slow"
 
 # Renew every measured table and picture of the pages: a night. The same call goes on after an interruption;
 # ONLY=held_out,rates renews these, RUNS is the folder of the runs. docs/experiments.md lists the studies.
