@@ -90,8 +90,8 @@ def carry_out(quiet: Sweep, hard: Sweep, runs: int) -> tuple[float, float, list[
     lived.append(kill_at(KILLED_AT[1] * runs, hard, process))
     finish(hard, hard.start(), 0)
     took = time.monotonic() - began
-    if left := [each for sweep in (quiet, hard) for each in sweep.outlived(0.0)[1]]:
-        sys.exit(f"the sweep is over and these live on: {left}")
+    if left := [each for sweep in (quiet, hard) for each in sweep.outlived(SOON)[1]]:
+        sys.exit(f"{SOON:g} s after the sweep these live on: {left}")
     return calm, took, lived
 
 
