@@ -11,6 +11,7 @@ import getpass
 import json
 import os
 import platform
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -168,8 +169,11 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
         can_resume: whether the batch could go on in it.
 
     Raises:
-        ConfigurationError: it has, or it cannot be read.
+        ConfigurationError: it has, it cannot be read, or its name is no text, of which Parquet could read no file.
     """
+    if any("\ud800" <= letter <= "\udfff" for letter in str(folder)):
+        encoding = sys.getfilesystemencoding()
+        raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; name another one with --out")
     try:
         taken = not is_unused(folder)
     except OSError as error:

@@ -27,7 +27,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import current_process, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -233,6 +233,11 @@ class Sandbox:
         """Return the link to a guard that runs; one that is ended while it starts is started once `again`."""
         if self._link is not None:
             return self._link
+        if current_process().daemon:
+            raise ConfigurationError(
+                "a daemonic process, such as one of multiprocessing.Pool, can start no worker processes; compare there "
+                "with workers=1 and without limits"
+            )
         context = get_context("fork") if self._copied else get_context("spawn")
         if not self._copied:
             resource_tracker.ensure_running()  # it ends the block of interrupts below if it starts there
@@ -270,8 +275,8 @@ class Sandbox:
         if process.exitcode not in (None, START_ERROR):
             return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
         return (
-            "the worker processes cannot be started; a script that starts some must keep its calls below "
-            "`if __name__ == '__main__':`"
+            "the worker processes cannot be started; a script that starts some must be a file and keep its calls "
+            "below `if __name__ == '__main__':`"
         )
 
 

@@ -116,6 +116,8 @@ def main() -> None:
     if sys.__stderr__ is not None:
         with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
             faulthandler.enable(sys.__stderr__)  # a segmentation fault, as of a plug-in, prints the line that it was in
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # `µ` where the encoding of the terminal lacks it
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as below `&` of a script and in some CI
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(os, "fork"):

@@ -47,6 +47,8 @@ class Terminal(Console):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+if os.environ.get("COLUMNS", "").strip("0") == "":  # as some programs tell their children: no line would be printed
+    os.environ.pop("COLUMNS", None)
 console = Terminal()
 
 

@@ -147,15 +147,15 @@ def _folder_plans(folder: Path, runs: pd.DataFrame, styles: Styles, size: int) -
 
 def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> NamedFigure | None:
     """Return a figure with its name and heading."""
-    with figure_style(TEXT):
-        figure = plan.draw(layout)
-    if figure is None:
-        return None
     heading, place = KINDS[plan.kind].heading, f"{group.plant}, mismatch {group.mismatch}" if group.plant else ""
     details = ", ".join(filter(None, (plan.part, place, _sample(plan.kind, group))))
-    if title:
-        wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
-        figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
+    with figure_style(TEXT):
+        figure = plan.draw(layout)
+        if figure is None:
+            return None
+        if title:
+            wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
+            figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
     words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
     stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
     return NamedFigure(plan.kind, stem, f"{heading}: {details}", plan.tasks, figure)

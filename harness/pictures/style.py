@@ -193,9 +193,16 @@ def fitted(name: str, letters: int) -> str:
 
 @contextmanager
 def figure_style(size: float = FILM_TEXT) -> Iterator[None]:
-    """Yield in the context in which every figure is drawn, with text of a size [pt]; fonts in PDF are embedded."""
+    """Yield in the context in which every figure is drawn, with text of a size [pt]; fonts in PDF are embedded.
+
+    A `matplotlibrc` or a style of the user's does not count: pictures are the same on every machine.
+    """
+    defaults: dict[Any, Any] = {
+        name: value for name, value in mpl.rcParamsDefault.items() if name != "backend" and mpl.rcParams[name] != value
+    }
     style = mpl.rc_context(
         {
+            **defaults,
             "font.size": size,
             "axes.titlesize": size,
             "axes.grid": True,
@@ -306,26 +313,25 @@ def save_figure(
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths, box = [], None
-    if exact_width:
-        with figure_style(TEXT):
+    with figure_style(TEXT):
+        if exact_width:
             drawn = box_of(figure)
             box = Bbox.from_extents(0.0, drawn.y0, figure.get_figwidth(), drawn.y1)
-    for ending in formats:
-        paths.append(stem.with_name(f"{stem.name}.{ending}"))
-        write_atomically(paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box)))
-        figure.set_layout_engine(None)  # freeze the layout: computing it dominates the save
+        for ending in formats:
+            paths.append(stem.with_name(f"{stem.name}.{ending}"))
+            write_atomically(paths[-1], partial(Path.write_bytes, data=_encode(figure, ending, box)))
+            figure.set_layout_engine(None)  # freeze the layout: computing it dominates the save
     return paths
 
 
 def _encode(figure: Figure, ending: str, box: Bbox | None) -> bytes:
     """Return the content of a file: a writer of PDF that finds no room on the disk ends in an error of its own."""
     content = io.StringIO() if ending == "pgf" else io.BytesIO()
-    with figure_style(TEXT):
-        if ending == "png" and box is None:  # drawn once; `savefig` would draw it twice
-            figure.set_dpi(RESOLUTION)
-            FigureCanvasAgg(figure).print_png(content, **UNDATED[ending])  # type: ignore[no-untyped-call]
-        else:
-            figure.savefig(content, format=ending, dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
+    if ending == "png" and box is None:  # drawn once; `savefig` would draw it twice
+        figure.set_dpi(RESOLUTION)
+        FigureCanvasAgg(figure).print_png(content, **UNDATED[ending])  # type: ignore[no-untyped-call]
+    else:
+        figure.savefig(content, format=ending, dpi=RESOLUTION, bbox_inches=box, **UNDATED.get(ending, {}))
     made = content.getvalue()
     if isinstance(made, bytes):
         return made

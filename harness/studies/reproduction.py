@@ -18,7 +18,7 @@ from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.batch.lock import locked
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
-from servobench.harness.pictures.style import method_styles, save_figure
+from servobench.harness.pictures.style import figure_style, method_styles, save_figure
 from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import write_atomically
@@ -78,7 +78,8 @@ def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
     """Draw a figure for each claim, a column a plant and division, a row a measurement; return all files."""
     files = []
     for claim in dict.fromkeys(answer.claim for answer in answers):
-        figure = _draw([answer for answer in answers if answer.claim == claim])
+        with figure_style():
+            figure = _draw([answer for answer in answers if answer.claim == claim])
         files += save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
     return files
 

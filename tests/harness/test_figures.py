@@ -3,6 +3,7 @@
 import json
 import math
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +17,7 @@ from servobench.harness.batch import results
 from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
-from servobench.harness.pictures.style import SETTLED, divisions, figure_style, method_styles, save_figure
+from servobench.harness.pictures.style import SETTLED, divisions, figure_style, method_styles, panel_grid, save_figure
 from servobench.harness.pictures.tracks import Track, load_ensembles, quantile, shown_until
 
 STYLES = method_styles(METHODS)
@@ -201,6 +202,25 @@ def test_a_name_that_the_font_lacks_is_drawn_without_a_word(tmp_path):
         figure = Figure()
         figure.text(0.5, 0.5, "\x00\U0001f600")
     assert [path.name for path in save_figure(figure, tmp_path / "a", ["png"])] == ["a.png"]
+
+
+def test_a_style_of_the_user_changes_no_picture(tmp_path):
+    table = pd.DataFrame({"controller": ["mfac", "ukf"], "settling_time_s": [1.0, 2.0]})
+    own = {
+        "font.size": 30.0,
+        "text.usetex": True,
+        "axes.facecolor": "black",
+        "figure.autolayout": True,
+        "savefig.dpi": 7,
+    }
+    for folder, style in (("plain", {}), ("own", own)):
+        with mpl.rc_context(style):
+            with figure_style():
+                figure, (panel,) = panel_grid(1, 2.0)
+                panel.scatter(table["controller"], table["settling_time_s"])
+            save_figure(figure, tmp_path / folder / "a", ["pdf", "png"])
+    for name in ("a.pdf", "a.png"):
+        assert (tmp_path / "own" / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
 
 
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])

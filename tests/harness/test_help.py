@@ -7,7 +7,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from kit.command import servobench
+from kit.command import python, servobench
 from servobench.harness.cli.main import PANELS, app, command_line, in_known_number
 from servobench.harness.cli.options import ABSENT, Value, command, named_option
 
@@ -47,6 +47,14 @@ def test_every_command_explains_itself_and_its_values_and_nothing_is_cut(output_
     assert "\\" not in text
     assert not re.search(r"<(?!date-time)|…", text)
     assert re.search(r"^│ (   )?--help +-h +Show this message and exit\.", text, re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_a_terminal_of_no_width_and_one_of_few_letters_print_all_words():
+    said = python("-m", "servobench", "tasks", COLUMNS="0", PYTHONIOENCODING="ascii")
+    assert (said.returncode, said.stderr) == (0, "")
+    assert "circle" in said.stdout
+    assert said.stdout.isascii()
 
 
 def test_no_word_in_brackets_is_taken_for_markup(output_of, monkeypatch):

@@ -44,6 +44,16 @@ def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_woul
     assert set(multiprocessing.active_children()) == before
 
 
+def test_a_daemonic_process_is_told_that_it_can_start_no_workers(monkeypatch):
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
+    workers = Pool(1, Limits(), ())
+    with pytest.raises(
+        ConfigurationError, match=r"^a daemonic process, such as one of multiprocessing\.Pool, can start"
+    ):
+        workers.submit(Task(print, b"")).result(60.0)
+    workers.stop()
+
+
 ONCE = """
 import os, pathlib, signal
 

@@ -152,6 +152,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--seed", "two"), "invalid value for '--seed'"),
     ((*RUN, "--view"), "--view shows the plant bullet only, got --plant kinematic"),
     ((*RUN, "--out", "file/new"), "cannot be written: Not a directory"),
+    ((*RUN, "--out", "caf\udce9"), "results folder caf\\udce9: its name is no utf-8; name another one with --out"),
     ((*RUN, "--out", "full"), "results folder full exists already; name another one with --out"),
     (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
     (("compare", "--controllers", "constant,cnstant"), "unknown controller 'cnstant': did you mean 'constant'?"),
