@@ -12,7 +12,7 @@ from servobench.controllers.aids import describe_aids
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
-from servobench.harness.run.request import SECTIONS
+from servobench.harness.run.request import SECTIONS, varied_columns
 from servobench.harness.run.result import COMPLETED
 
 DESCRIBED: Final = {name: name for name in ("plant", "sensing", "controller", "task", "mismatch")} | {
@@ -161,6 +161,7 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
         + f"Python {manifest.get('python', 'unknown')}, {', '.join(used)})".translate(SIGNS),
         f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
         f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {facts['mismatch']}",
+        *_varied(facts, runs),
         f"Every controller met the same {count} random robot{'s' * (count > 1)} (seeds {seeds}; {len(runs)} runs)",
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
         "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
@@ -170,6 +171,12 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     text = [sentences[0], *(each.translate(SIGNS) for each in sentences[1:])]
     year = str(manifest.get("created", ""))[:4].translate(SIGNS)
     return rf"\paragraph{{Methods}} {'. '.join(text)}." + "\n\n" + BIBTEX % (year, f"{version}, commit {commit}")
+
+
+def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> list[str]:
+    """Return a sentence with the values of each setting that the runs vary; none if they vary none."""
+    heads = [DESCRIBED.get(name, name) for name in varied_columns(runs.columns) if runs[name].nunique(dropna=False) > 1]
+    return [f"Varied: {'; '.join(f'{head} {facts[head]}' for head in heads)}"] if heads else []
 
 
 def _settings(changed: Mapping[str, Any] | None) -> str:

@@ -45,7 +45,7 @@ from servobench.harness.analysis.comparison import (
     texts_of,
     with_places,
 )
-from servobench.harness.analysis.verdict import judged_metric, judged_values
+from servobench.harness.analysis.verdict import judged_column, judged_metric
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import (
     ACHIEVED,
@@ -161,13 +161,14 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     compared = compare_pairs(runs, pairs, metric=metric, keys=("seed",))
     unit, factor = shown_unit(metric, runs) if metric in METRICS else ("1", 1.0)
     heading = metric_heading(metric, runs) if metric in METRICS else metric.replace("_", " ")
+    words = {} if metric in METRICS and METRICS[metric].better else {"better": "less", "worse": "more"}
     return [
         {
             PAIR: Cell(f"{first} − {second}"),
             "runs lost": Cell("{} : {}".format(*each.lost)),
             f"mean difference in {heading}": Cell(each.mean.scaled(factor), ".2f"),
-            "verdict": Cell(each.verdict),
-            "P(A better)": Cell(each.probability, ".2f"),
+            "verdict": Cell(words.get(each.verdict, each.verdict)),
+            f"P(A {words.get('better', 'better')})": Cell(each.probability, ".2f"),
             "margin": Cell(f"{factor * margin(metric, runs):.2g} {unit}".removesuffix(" 1")),
         }
         for (first, second), each in zip(pairs, compared, strict=True)
@@ -221,7 +222,10 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             row = {"controller": str(name), "outcome": _shares(own)}
             for column, summary in summaries:
                 heading = metric_heading(column, place)
-                middle = shown_unit(column, place)[1] * column_of(own, column).median()
+                values = column_of(own, column)
+                if column == "settling_time_s" and settling_times(own).notna().any():
+                    values = settling_times(own).fillna(math.inf)  # as in the statistics
+                middle = shown_unit(column, place)[1] * values.median()
                 row[heading] = number(middle, f".{summary.digits}f")
                 if column == STEP_TIME and _is_late(own):
                     row[heading] += LATE
@@ -304,11 +308,15 @@ PageRow = dict[tuple[str, str], Any]
 def overview(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the success rate and score of each controller, a group of columns for each place.
 
-    Where there are many conditions, a group is a task with all its conditions.
+    Where there are many conditions, a group is a task with all its conditions; medians are over all its runs then, and
+    have no interval, as runs of one seed in several conditions are no independent ones.
     """
-    places = split_conditions(runs)
+    places, interval = split_conditions(runs), True
     if len(places) > MOST_PLACES:
-        places = [(str(task), own) for task, own in runs.groupby("task", sort=False)]
+        pooled = runs.groupby(["task", "feature_unit"], sort=False, dropna=False)
+        units = runs["feature_unit"].nunique(dropna=False) > 1
+        places = [(f"{task}, features in {unit}" if units else str(task), own) for (task, unit), own in pooled]
+        interval = False
     single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
     rows: list[PageRow] = []
     for name in ordered(runs["controller"]):
@@ -317,10 +325,10 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             own = place[place["controller"] == name]
             where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
             row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
-            table, metric = judged_values(place), judged_metric(place)
-            digits, known = METRICS[metric].digits, name in table and len(table)
-            middle = f"{median_with_interval(table[name]):.{digits}f}" if known else MISSING
-            row[where, metric_heading(metric, place)] = middle
+            metric = judged_metric(place)
+            middle = median_with_interval(judged_column(place)[place["controller"] == name])
+            middle = middle if interval else Estimate(middle.value, math.nan, math.nan, middle.count)
+            row[where, metric_heading(metric, place)] = f"{middle:.{METRICS[metric].digits}f}"
         rows.append(row)
     return grouped(rows)
 

@@ -6,6 +6,8 @@ however many tasks it was run on, as runs of one seed share a robot. Controllers
 are not ranked.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ from servobench.harness.analysis.comparison import (
     knows_truth,
     margin,
     median_with_interval,
+    number,
     outcomes,
     paired_difference,
     settling_times,
@@ -93,11 +96,19 @@ def judged_metric(place: pd.DataFrame) -> str:
 
 
 def judged_values(place: pd.DataFrame) -> pd.DataFrame:
-    """Return the judged metric in the unit in which it is shown, seeds × controllers; infinite where a run is lost."""
-    metric = judged_metric(place)
-    values = shown_unit(metric, place)[1] * column_of(place, metric).where(place["status"] == COMPLETED)
-    table = place.assign(value=values.fillna(np.inf))
+    """Return the judged metric in the unit in which it is shown, seeds × controllers.
+
+    It is infinite where a run is lost, and NaN where there is none, as in an unfinished batch.
+    """
+    table = place.assign(value=judged_column(place))
     return table.pivot_table(index="seed", columns="controller", values="value", sort=False)
+
+
+def judged_column(runs: pd.DataFrame) -> pd.Series[float]:
+    """Return the judged metric of each run in the unit in which it is shown; infinite where the run is lost."""
+    metric = judged_metric(runs)
+    values = shown_unit(metric, runs)[1] * column_of(runs, metric).where(runs["status"] == COMPLETED)
+    return values.fillna(np.inf)
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:
@@ -118,10 +129,10 @@ def _of_one_run(runs: pd.DataFrame) -> str:
 def _of_one_controller(runs: pd.DataFrame) -> str:
     sentence = f"`{runs['controller'].iloc[0]}` {asked_of(runs)} in {_share(runs)}"
     moves, _ = split_tasks(runs)
-    if len(moves) == len(runs) and settling_times(runs).notna().any():
+    if len(moves) == len(runs) and settling_times(runs).notna().any() and len(split_conditions(runs)) == 1:
         middle = median_with_interval(settling_times(runs))
-        sentence += f", after a median of {middle.value:.2f} s (95 % interval: {middle.low:.2f} to {middle.high:.2f} s)"
-        sentence = sentence.replace("inf", "∞")
+        value, low, high = (number(each, ".2f") for each in (middle.value, middle.low, middle.high))
+        sentence += f", after a median of {value} s (95 % interval: {low} to {high} s)"
     return sentence + "."
 
 
@@ -136,7 +147,13 @@ def _of_several(runs: pd.DataFrame) -> str:
         everyone = "Both controllers" if len(shares) == 2 else f"All {len(shares)} controllers"
         often = "every run" if most == 1.0 else f"{100.0 * most:.0f} % of their runs"
         return f"{everyone} {asked} in {often}."
-    first, last = (_share(runs[runs["controller"] == names[0]]) for names in (best, worst))
+    counts = runs["controller"].value_counts()  # they differ in an unfinished batch
+    first, last = (
+        _share(runs[runs["controller"] == names[0]])
+        if counts[names].nunique() == 1
+        else f"{100.0 * share:.0f} % of runs"
+        for names, share in ((best, most), (worst, least))
+    )
     top = f"{_listed(best)} {'each ' if len(best) > 1 else ''}{asked} in {first}"
     return f"{top}; least often {_listed(worst)}, in {last}."
 
@@ -162,7 +179,8 @@ def _winners(runs: pd.DataFrame, names: Sequence[str]) -> str:
         return ""
     groups: dict[tuple[object, ...], list[_Standing]] = {}
     for each in known:
-        groups.setdefault((each.equal, each.undecided, each.ahead, each.behind, each.metric), []).append(each)
+        told = each.equal, each.undecided, each.ahead, each.behind, math.isnan(each.by), each.metric, each.unit
+        groups.setdefault(told, []).append(each)
     return "; ".join(_clause(own, len(known)) for own in groups.values()) + "."
 
 
@@ -250,7 +268,7 @@ def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[st
     rivals = [name for name, each in against.items() if each.verdict != "better"]
 
     def median(name: str) -> str:
-        value, *interval = f"{median_with_interval(table[name]):.{METRICS[metric].digits}f}".split(" ", 1)
+        value, *interval = f"{median_with_interval(table[name].dropna()):.{METRICS[metric].digits}f}".split(" ", 1)
         lost = f"({100.0 * (1.0 - shares[name]):.0f} % lost)" if shares[name] < 1.0 else ""
         return " ".join([value, unit, *interval, lost]).rstrip()
 

@@ -254,6 +254,9 @@ def load_runs(folder: Path) -> pd.DataFrame:
     runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
     runs = runs.astype({name: float for name in tables.MOST if name in runs and runs[name].dtype == object})
+    period = (read_manifest(folder).get("changed") or {}).get("run.period")
+    if isinstance(period, float):  # of all runs whose period no sweep varies
+        runs["period_s"] = runs["period_s"].fillna(period) if "period_s" in runs else period
     refuse_nameless(folder / names[0], runs)
     return runs
 

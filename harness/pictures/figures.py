@@ -166,9 +166,11 @@ def _sample(kind: str, group: Group) -> str:
     seeds, how = group.runs["seed"].nunique(), KINDS[kind].seeds
     if how == FIRST or seeds == 1:
         return f"seed {group.seed}"
+    least = int(group.runs.groupby(["controller", "task"])["seed"].nunique().min())  # of an unfinished batch
+    count = f"{least} to {seeds} seeds" if least < seeds else f"{seeds} seeds"
     if how == EACH:
-        return f"{seeds} seeds"
-    words = f"median of {seeds} seeds, band: the middle 80 %"
+        return count
+    words = f"median of {count}, band: the middle 80 %"
     return f"{words}; errors in features of seed {group.seed}" if kind == "tracking" else words
 
 

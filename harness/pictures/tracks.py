@@ -14,7 +14,7 @@ from typing import Any, Self, final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, with_places
+from servobench.harness.analysis.comparison import POINT_TO_POINT, column_of, handy_unit, settling_times, with_places
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -234,7 +234,13 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     tracks: dict[str, dict[str, list[Track]]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
         tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
-    return {task: {name: _ensemble(own, share) for name, own in named.items()} for task, named in tracks.items()}
+    never = (
+        runs[(runs["status"] != COMPLETED) & (column_of(runs, "periods") == 0.0)].groupby(["task", "controller"]).size()
+    )
+    return {
+        task: {name: _ensemble(own, int(never.get((task, name), 0)), share) for name, own in named.items()}
+        for task, named in tracks.items()
+    }
 
 
 def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
@@ -247,8 +253,8 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
     return min(end, max(MARGIN * max(times), MIN_SHARE * end))
 
 
-def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
-    """Return the ensemble of tracks; a camera moves after that share of a run."""
+def _ensemble(tracks: Sequence[Track], never: int, camera_moves_at: float) -> Ensemble:
+    """Return the ensemble of tracks and of runs that never began; a camera moves after that share of a run."""
     runs, longest = pd.DataFrame([track.row for track in tracks]), max(tracks, key=lambda track: len(track.table))
     moves = any(values_drawn(row).get("move_angle", 0.0) != 0.0 for row in runs.to_dict("records"))
     known = moves and not math.isnan(camera_moves_at)
@@ -263,10 +269,13 @@ def _ensemble(tracks: Sequence[Track], camera_moves_at: float) -> Ensemble:
     return Ensemble(
         tracks[0].row,
         time,
-        np.stack([padded(track.error(), math.nan if track.completed else math.inf) for track in few]),
+        np.stack(
+            [padded(track.error(), math.nan if track.completed else math.inf) for track in few]
+            + never * [np.full(len(time), math.inf)]
+        ),
         np.stack([padded(100.0 * track.column(JACOBIAN), math.nan) for track in few]),
         times[times > 0.0],
-        float(settling_times(runs).fillna(math.inf).median()),
-        bool((runs["status"] != COMPLETED).mean() >= BAND[1]),
+        float(np.median([*settling_times(runs).fillna(math.inf), *never * [math.inf]])),
+        bool(((runs["status"] != COMPLETED).sum() + never) / (len(runs) + never) >= BAND[1]),
         moved_at,
     )

@@ -136,7 +136,8 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     rows = as_text(methods_rows(judged))
     for (name, plant), place in rows.groupby(["challenge", "plant"], sort=False):
         about, measure = place.iloc[0], MEASURES[place["measure"].iloc[0]]
-        fails = float(about["reference_lost"]) > 100.0 * MAX_REFERENCE_LOSS
+        scored = judged[(judged["challenge"] == name) & (judged["plant"] == plant) & judged["score"].notna()]
+        fails = len(scored) > 0 and bounded(scored).empty
         grade = "no grade, as its references fail" if fails else about["grade"] or "ungraded"
         bound = f"reference {about['reference']} {measure.unit}, lost {about['reference_lost']} %"
         heads = {"controller": "controller", "runs": "runs", "good": f"{measure.achieved}, %",

@@ -54,6 +54,16 @@ def test_a_run_that_ended_is_infinitely_far_in_a_quantile():
     assert quantile(values[:3], 0.5).tolist() == [3.0, 3.0]
 
 
+def test_runs_that_ended_before_their_first_period_count_in_curve_and_mark(tmp_path):
+    rows = [made_up_row(f"r{i}", seed=i) for i in range(2)]
+    rows += [made_up_row(f"r{i}", seed=i, status="crashed", periods=0, settling_time_s=np.nan) for i in range(2, 5)]
+    ensemble = load(tmp_path / "out", rows, [made_up_steps("r0"), made_up_steps("r1")])["exp1"]["ukf_mfac"]
+    assert len(ensemble.error) == 5
+    assert np.isinf(quantile(ensemble.error, 0.5)).all()
+    assert ensemble.settling_time == math.inf
+    assert ensemble.mostly_ended
+
+
 def test_the_error_over_time_is_the_median_of_all_seeds_and_a_band(tmp_path):
     ensembles = seeds_of(tmp_path / "out", [1.0, 2.0, 4.0])
     axes = draw_moves({"exp1": ensembles}, STYLES).axes[0]

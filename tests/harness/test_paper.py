@@ -51,6 +51,7 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
     assert re.search(r"Python 3\.\d+\.\d+, numpy [\d.]+, scipy [\d.]+\)", text)
     assert "Controllers: constant, calibrated; tasks: exp2; plant: kinematic (UR5)" in text
     assert "the same 2 random robots (seeds 0, 1; 4 runs)" in text
+    assert "Varied" not in text
     assert "Settings other than the defaults: exp2.duration = 2." in text
     assert "@misc{servobench," in text
 

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
+from kit import folders
 from kit.command import python, servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
 from servobench.harness.analysis.comparison import Estimate, split_conditions, split_tasks
@@ -14,6 +15,7 @@ from servobench.harness.analysis.tables import (
     Cell,
     curve_tables,
     outcome_legend,
+    overview,
     statistics_tables,
     summary_legend,
     summary_tables,
@@ -83,6 +85,30 @@ def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
     (row,) = compare_controllers(few).to_dict("records")
     assert row["mean difference in settling time [s]"].startswith("28.9")
     assert (row["runs lost"], row["P(A better)"][:4]) == ("0 : 4", "0.50")
+
+
+def test_of_a_measure_without_a_good_direction_the_verdict_is_less_or_more(runs):
+    runs["max_joint_position_rad"] = np.where(runs["controller"] == "quick", 1.0, 2.0) + 0.001 * runs["seed"]
+    (_, _), (_, pairs) = statistics_tables(runs, "max_joint_position_rad")
+    assert pairs["verdict"].tolist() == ["less"]
+    assert "P(A less)" in pairs
+
+
+def test_a_median_over_many_conditions_is_one_over_runs_and_has_no_interval(runs):
+    runs["status"] = "completed"
+    many = [runs.assign(mismatch=f"links={each}%", settling_time_s=each / 10.0) for each in range(1, 6)]
+    lost = runs.assign(mismatch="severe", settling_time_s=np.nan)
+    table = overview(pd.concat([*many, lost]))
+    assert table["random", "settling time [s]"].tolist() == ["0.35", "0.35"]
+    both = pd.concat([*many, lost, *(each.assign(feature_unit="px") for each in many)])
+    assert {place for place, _ in overview(both)} == {"", "random, features in m", "random, features in px"}
+
+
+def test_a_period_that_is_set_is_the_margin_of_times(tmp_path, monkeypatch):
+    monkeypatch.setitem(folders.MANIFEST, "changed", {"run.period": 0.2})
+    loaded = results.load_runs(sweep(tmp_path / "sweep"))
+    assert loaded["period_s"].unique().tolist() == [0.2]
+    assert "margin of 0.2 s" in [title for title, _ in statistics_tables(loaded)][1]
 
 
 def test_conditions_are_told_apart_in_words(runs):
@@ -179,6 +205,13 @@ def test_the_outcomes_of_several_runs_are_shares():
     ((_, table),) = summary_tables(runs)
     assert table["outcome"].tolist() == ["75 % settled\n25 % target_unreachable"]
     assert judge_controllers(runs)["failures"].tolist() == ["1 target_unreachable"]
+
+
+def test_runs_that_never_settled_are_in_the_median_of_the_summary(runs):
+    runs.loc[runs["seed"] < 12, "settling_time_s"] = np.nan
+    runs.loc[runs["seed"] == 4, ["status", "settling_time_s"]] = ["collision", 0.2]
+    ((_, table),) = summary_tables(runs)
+    assert table["settling time [s]"].tolist() == ["∞", "∞"]
 
 
 def test_an_endless_curve_tells_its_second_lap_and_its_joints():

@@ -126,3 +126,38 @@ def test_the_first_by_one_run_is_not_said_to_beat_those_that_are_faster():
     lead = "`reliable` is best: 1.00 s ahead of `slow` in settling time, though `fast` had less settling time."
     assert judge(runs).result == lead
     assert judge(runs).cautions[1:] == ("The success rates do not differ significantly.",)
+
+
+def test_errors_of_different_units_are_in_no_common_range():
+    curves = runs_of(8, a=np.nan, b=np.nan).assign(task_kind="curve", task="circle")
+    curves.loc[curves["controller"] == "b", "rms_error_evaluated"] *= 3.0
+    other = curves.assign(
+        sensing="pixel", feature_unit="px", rms_error_evaluated=1000.0 * curves["rms_error_evaluated"]
+    )
+    result = judge(pd.concat([curves.assign(sensing="position"), other])).result
+    assert "4.00 mm ahead of `b`" in result
+    assert "4.00 px ahead of `b`" in result
+
+
+def test_where_lost_runs_tell_is_told_apart_from_where_times_do_in_whatever_order():
+    near, lost = runs_of(8, a=1.0, b=1.5), runs_of(8, a=1.0, b=np.nan).assign(mismatch="severe")
+    for parts in ((near, lost), (lost, near)):
+        clauses = judge(pd.concat(parts)).result.rstrip(".").split("; ")
+        assert sorted(each.partition(" on kinematic, ")[2] for each in clauses) == [
+            "moderate`: 0.50 s ahead of `b` in settling time", "severe`, losing fewer runs than `b`",
+        ]  # fmt: skip
+
+
+def test_runs_that_an_unfinished_batch_lacks_are_neither_lost_nor_settled():
+    runs = runs_of(10, a=1.0, b=1.0, c=np.nan)
+    part = runs[(runs["controller"] != "b") | (runs["seed"] < 4)]
+    assert leaders(part)["Next", "median"].tolist() == ["1.02 s [1.00, 1.03]"]
+    assert judge(part).result.startswith("`a` and `b` are best")
+    assert "`a` and `b` each settled in 100 % of runs; least often `c`, in 0 of 10" in judge(part).cautions[0]
+
+
+def test_one_controller_has_a_median_in_one_place_only_and_keeps_its_name():
+    runs = runs_of(8, h_inf=1.0)
+    assert "after a median of 1.03 s" in judge(runs).result
+    several = judge(pd.concat([runs, runs.assign(mismatch="severe")])).result
+    assert several == "`h_inf` settled in 16 of 16 runs (95 % interval: 81 to 100 %)."
