@@ -326,7 +326,8 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
             where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
             row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
             metric = judged_metric(place)
-            middle = median_with_interval(judged_column(place)[place["controller"] == name])
+            values = judged_column(place)[place["controller"] == name]
+            middle = median_with_interval(values) if len(values) else NO_ESTIMATE
             middle = middle if interval else Estimate(middle.value, math.nan, math.nan, middle.count)
             row[where, metric_heading(metric, place)] = f"{middle:.{METRICS[metric].digits}f}"
         rows.append(row)

@@ -196,7 +196,10 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
     with configuration_errors(f"camera file {path}: "):
         files = [path, path.parent / keys.intrinsics] if toml and keys.intrinsics else [path]
         if keys.intrinsics:
-            keys = override(files[-1].name, keys, read_intrinsics(files[-1]))
+            read = read_intrinsics(files[-1])
+            if toml and (twice := sorted(set(read) & set(values))):
+                raise ValueError(f"{twice[0]} is given here and by {keys.intrinsics}, its intrinsics; leave one out")
+            keys = override(files[-1].name, keys, read)
         pair = read_camera(path.parent / keys.second, second=True) if keys.second else None
         camera = OwnCamera((*files, *(pair.files if pair else ())), keys, _matrix(keys), _coefficients(keys), pair)
         _check(camera)
@@ -230,7 +233,10 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
             keys[key] = value.get("data", []) if isinstance(value, dict) else value
     roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
     parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
-    if any(each not in (None, 0, 1, keys["width"], keys["height"]) for each in parts):
+    full = 1, 1, keys["width"], keys["height"]
+    if found.get("fisheye_model"):
+        raise ValueError(f"{path.name} is of OpenCV's fisheye model; wanted {MODELS[0]} with {', '.join(COEFFICIENTS)}")
+    if any(part not in (None, 0, whole) for part, whole in zip(parts, full, strict=True)):
         part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
         raise ValueError(f"{path.name} is of a larger image, of which {part}")
     return keys | {"matrix": in_rows(keys["matrix"])}

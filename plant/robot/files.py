@@ -18,6 +18,7 @@ may have one entry more, which leads to the flange.
 Of a URDF, read by yourdfpy, the chain with the most rotating joints is taken, with its limits, masses and torques.
 """
 
+import contextlib
 import logging
 import re
 from collections.abc import Mapping
@@ -150,6 +151,7 @@ def _arm_of(table: DhTable) -> SerialArm:
 
 
 TURNING: Final = ("revolute", "continuous")
+COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 RPY: Final = re.compile(r"""\brpy\s*=\s*["']([^"']*)""")
 DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 
@@ -211,9 +213,10 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
         log.removeFilter(collect)
     if said:
         raise ValueError(f"robot file {path} is no URDF, with a <robot> as its root: {' '.join(said[0].split())}")
-    turns = " ".join(RPY.findall(path.read_text(encoding="utf-8", errors="replace"))).split()
-    if large := [turn for turn in turns if abs(float(turn)) > 7.0]:
-        remark(f"robot file {path} has an rpy of {large[0]}, and angles of a URDF are in rad")
+    turns = " ".join(RPY.findall(COMMENT.sub("", path.read_text(encoding="utf-8", errors="replace")))).split()
+    with contextlib.suppress(ValueError):  # of a word that the reader above did not need
+        if large := [turn for turn in turns if abs(float(turn)) > 7.0]:
+            remark(f"robot file {path} has an rpy of {large[0]}, and angles of a URDF are in rad")
     return read
 
 
@@ -224,6 +227,8 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
     for joint in tree.joints:
         if lost := {joint.parent, joint.child} - set(links):
             raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(map(str, lost))!r}")
+    if not links or not tree.joints:
+        raise ValueError("it has no links and joints; of a xacro file, take what `xacro FILE` prints")
     roots = sorted({joint.parent for joint in tree.joints} - set(above))
     if len(roots) > 1:
         raise ValueError(f"both {' and '.join(roots)} are without a parent: a joint is missing or turned round")
@@ -236,6 +241,10 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
         raise ValueError("it has no chain of at least three turning joints")
     chain, pose = [], np.eye(4)
     for joint in way:
+        if joint.mimic is not None:
+            raise ValueError(
+                f"joint {joint.name!r} on the way to {tip!r} turns with another (mimic), which is not modelled"
+            )
         if joint.type not in (*TURNING, "fixed"):
             raise ValueError(f"joint {joint.name!r} on the way to {tip!r} is of type {joint.type}; name another link")
         pose = pose @ _pose(joint.origin)
@@ -287,8 +296,9 @@ def _limits(chain: list[Joint]) -> JointLimits:
     rows, lacking = [], list[str]()
     for link in chain:
         limit, safety, endless = link.joint.limit, link.joint.safety_controller, link.joint.type == "continuous"
-        ranged = limit is not None and limit.lower is not None and limit.upper is not None
-        lower, upper = (limit.lower, limit.upper) if ranged and not endless else (-2 * pi, 2 * pi)
+        ends = (None, None) if limit is None else (limit.lower, limit.upper)
+        ranged = ends != (None, None)
+        lower, upper = (ends[0] or 0.0, ends[1] or 0.0) if ranged and not endless else (-2 * pi, 2 * pi)  # 0 by default
         speed = 0.0 if limit is None else limit.velocity or 0.0
         given = {"range": ranged or endless, "velocity": speed}
         lacking += [f"{word} of {link.joint.name}" for word in given if not given[word]]
@@ -312,7 +322,7 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     own = [inertials[link.joint.child] for link in chain]
     efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]
     torque = np.array(efforts) if all(isfinite(effort) and effort > 0.0 for effort in efforts) else None
-    if any(inertial is None or not inertial.mass for inertial in own):
+    if any(inertial is None or not inertial.mass or inertial.inertia is None for inertial in own):
         further = "" if torque is not None else ", torque limits"
         return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}"
     mass = np.array([inertial.mass for inertial in own], dtype=np.float64)

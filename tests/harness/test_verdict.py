@@ -151,13 +151,12 @@ def test_where_lost_runs_tell_is_told_apart_from_where_times_do_in_whatever_orde
 def test_runs_that_an_unfinished_batch_lacks_are_neither_lost_nor_settled():
     runs = runs_of(10, a=1.0, b=1.0, c=np.nan)
     part = runs[(runs["controller"] != "b") | (runs["seed"] < 4)]
-    assert leaders(part)["Next", "median"].tolist() == ["1.02 s [1.00, 1.03]"]
-    assert judge(part).result.startswith("`a` and `b` are best")
-    assert "`a` and `b` each settled in 100 % of runs; least often `c`, in 0 of 10" in judge(part).cautions[0]
+    assert leaders(part)["First", "median"].tolist() == ["1.02 s [1.00, 1.03]"]
+    assert "`a` and `b` each settled in 100 % of runs; least often `c`, in 0 of 10" in judge(part).result
 
 
 def test_one_controller_has_a_median_in_one_place_only_and_keeps_its_name():
     runs = runs_of(8, h_inf=1.0)
-    assert "after a median of 1.03 s" in judge(runs).result
+    assert "after a median of 1.04 s" in judge(runs).result
     several = judge(pd.concat([runs, runs.assign(mismatch="severe")])).result
     assert several == "`h_inf` settled in 16 of 16 runs (95 % interval: 81 to 100 %)."
