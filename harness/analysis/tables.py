@@ -222,10 +222,12 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             row = {"controller": str(name), "outcome": _shares(own)}
             for column, summary in summaries:
                 heading = metric_heading(column, place)
-                values = column_of(own, column)
-                if column == "settling_time_s" and settling_times(own).notna().any():
-                    values = settling_times(own).fillna(math.inf)  # as in the statistics
-                middle = shown_unit(column, place)[1] * values.median()
+                if column == "settling_time_s":
+                    middle = (
+                        settling_times(own).fillna(math.inf).median() if settling_times(own).notna().any() else math.nan
+                    )
+                else:
+                    middle = shown_unit(column, place)[1] * column_of(own, column).median()
                 row[heading] = number(middle, f".{summary.digits}f")
                 if column == STEP_TIME and _is_late(own):
                     row[heading] += LATE

@@ -30,6 +30,7 @@ from servobench.harness.analysis.comparison import (
     Verdict,
     margin,
     median_with_interval,
+    number,
     paired_difference,
     settling_times,
     success_rate,
@@ -252,7 +253,7 @@ def _keeps_up(tables: Tables, plant: str) -> Answer:
         measured.append(replace(own, label=PROPOSED))
         level = {name: median_with_interval(100.0 * both.loc[task][name]) for name in ("online", "frozen")}
         levels += [Measurement("Jacobian error, mean of a run, %", task, name, level[name]) for name in level]
-        words.append(f"{task} {level['online'].value:.1f} / {level['frozen'].value:.1f} %")
+        words.append(f"{task} {number(level['online'].value, '.1f')} / {number(level['frozen'].value, '.1f')} %")
     evidence = f"median error online / as trained: {', '.join(words)}"
     return answer("7", "its estimator keeps up with the true Jacobian", plant, measured, evidence, levels)
 

@@ -238,6 +238,10 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
             HEAVY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>'),
             ": joint 'joint_2' turns about the axis 0 0 0; the usual one",
         ),
+        (
+            HEAVY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="joint_1"/>'),
+            r".*joint 'joint_2' on the way to '.*' turns with another \(mimic\)",
+        ),
         (HEAVY.replace('<mass value="2', '<mass value="-2'), ": link 'link_1': mass must be above 0, got -2.0"),
         (TWO_TREES, ".*both foot and link_4 are without a parent: a joint is missing or turned"),
         (
