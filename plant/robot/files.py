@@ -296,9 +296,8 @@ def _limits(chain: list[Joint]) -> JointLimits:
     rows, lacking = [], list[str]()
     for link in chain:
         limit, safety, endless = link.joint.limit, link.joint.safety_controller, link.joint.type == "continuous"
-        ends = (None, None) if limit is None else (limit.lower, limit.upper)
-        ranged = ends != (None, None)
-        lower, upper = (ends[0] or 0.0, ends[1] or 0.0) if ranged and not endless else (-2 * pi, 2 * pi)  # 0 by default
+        ranged = limit is not None and limit.lower is not None and limit.upper is not None
+        lower, upper = (limit.lower, limit.upper) if ranged and not endless else (-2 * pi, 2 * pi)
         speed = 0.0 if limit is None else limit.velocity or 0.0
         given = {"range": ranged or endless, "velocity": speed}
         lacking += [f"{word} of {link.joint.name}" for word in given if not given[word]]
