@@ -1,12 +1,14 @@
 #include "model.h"
 #include "controller.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* How far from a sampling instant the importer's time may be [1 of the period]. */
+/* How far from a sampling instant the importer's time may be: a share of the period, and rounding of the time itself. */
 #define SAMPLE_SHARE 1e-6
+#define ROUNDING (8.0 * DBL_EPSILON)
 /* In one step. */
 #define MAX_SAMPLES 1e6
 
@@ -32,7 +34,10 @@ const char *model_set(Model *model, size_t index, double value, int starting)
     return NULL;
 }
 
-static double instant(const Model *model) { return model->begun ? model->first + model->sample * PERIOD : model->time; }
+/* When the next sample is due. Each sample begins a period anew, so that a sum of many steps need not be a multiple. */
+static double due(const Model *model) { return model->begun ? model->due : model->time; }
+
+static double tolerance(double time) { return SAMPLE_SHARE * PERIOD + ROUNDING * fabs(time); }
 
 /* There is nothing to begin with before a feature is seen. */
 static int waits(const Model *model)
@@ -44,11 +49,15 @@ static int waits(const Model *model)
 }
 
 /* Where the last sample of a step may be. */
-static double last_instant(const Model *model, double step) { return model->time + step - SAMPLE_SHARE * PERIOD; }
+static double last_instant(const Model *model, double step)
+{
+    const double end = model->time + step;
+    return end - tolerance(end);
+}
 
 const char *model_check(const Model *model, double step)
 {
-    const int endless = !waits(model) && last_instant(model, step) - instant(model) > MAX_SAMPLES * PERIOD;
+    const int endless = !waits(model) && last_instant(model, step) - due(model) > MAX_SAMPLES * PERIOD;
     return endless ? "the step is longer than a million periods" : NULL;
 }
 
@@ -59,7 +68,7 @@ static void compute(Model *model, double *scratch)
     const double *arguments[N_POINTERS];
     double *results[N_POINTERS];
     int iw[N_WHOLE_WORK];
-    u[0] = instant(model);
+    u[0] = model->begun ? model->first + model->sample * PERIOD : model->time;
     memcpy(u + 1, model->values, N_SETTABLE * sizeof(double));
     model->fault = 0.0;
     const double *memory = model->memory;
@@ -97,7 +106,7 @@ const char *model_get(Model *model, size_t index, double *value)
 {
     *value = model->values[index];
     if (index < N_SETTABLE || !model->touched || waits(model)) return NULL;
-    if (model->time < instant(model) - SAMPLE_SHARE * PERIOD) return NULL;
+    if (model->time < due(model) - tolerance(model->time)) return NULL;
     const char *message = ensure_known(model);
     if (message == NULL) *value = model->answers[index - N_SETTABLE];
     return message;
@@ -107,7 +116,9 @@ static const char *take_sample(Model *model)
 {
     const char *message = ensure_known(model);
     if (message != NULL) return message;
-    if (!model->begun) model->first = model->time;
+    const double now = due(model);
+    if (!model->begun) model->first = now;
+    model->due = PERIOD + (fabs(model->time - now) <= tolerance(now) ? model->time : now);
     memcpy(model->memory, model->next, sizeof model->memory);
     memcpy(model->values + N_SETTABLE, model->answers, sizeof model->answers);
     model->begun = 1;
@@ -119,7 +130,7 @@ static const char *take_sample(Model *model)
 const char *model_step(Model *model, double step)
 {
     const double end = last_instant(model, step);
-    while (instant(model) < end && !waits(model)) {
+    while (due(model) < end && !waits(model)) {
         const char *message = take_sample(model);
         if (message != NULL) return message;
     }

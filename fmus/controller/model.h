@@ -19,6 +19,7 @@ typedef struct {
     int exchange;
     double values[N_VALUES];    /* inputs, then outputs of the last sample */
     double first;               /* time of the first sample */
+    double due;                 /* when the importer's time reaches the next one */
     double sample;              /* k, a whole number */
     int begun;                  /* there is a state */
     int touched;                /* an input was set after the last step */

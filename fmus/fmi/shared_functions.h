@@ -61,7 +61,7 @@ Status FMI(SetDebugLogging)(Handle instance, Boolean on, size_t count, const Str
     OPEN(~0);
     const unsigned bits = category_bits(count, categories);
     if (bits == 0) return ANSWER("there is no such category");
-    self->logged = on ? self->logged | bits : self->logged & ~bits;
+    self->logged = on ? bits : 0;
     return FMI(OK);
 }
 

@@ -12,6 +12,9 @@
 /* Over which play is updated once, and the acceleration of a flexible tool changes linearly, at most [s]. */
 #define MAX_PART 0.005
 #define MAX_PARTS 1000.0 /* of a step; an importer may ask for one of any length */
+/* Of a flexible tool [rad/s]: the closed form loses its digits below, and overflows far above. */
+#define MIN_FREQUENCY 0.1
+#define MAX_FREQUENCY 1e6
 
 enum { STALE_FEATURE = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
@@ -95,6 +98,8 @@ static void evaluate(CoreFunction *function, const Model *model, const double *d
     function(arguments, results, NULL, work, 0);
 }
 
+static int is_flexible(const Model *model) { return model->values[OFFSET_TOOL_FREQUENCY] > 0.0; }
+
 void model_reset(Model *model, int exchange)
 {
     memset(model, 0, sizeof *model);
@@ -113,11 +118,29 @@ void model_start(Model *model)
         model->driven[i] = gear_position(model, i);
     }
     memset(model->values + OFFSET_TOOL_DEFLECTION, 0, 6 * sizeof(double));
+    model->flexible = is_flexible(model);
     model->stale = STALE_ALL;
+}
+
+/* A tool that became flexible or rigid is where a rigid one is, and moves as it does; whether states changed. */
+static int match_tool(Model *model)
+{
+    double motion[6] = {0.0}; /* of a rigid one: its velocity comes last, and is 0 in place of a state */
+    if (model->flexible == is_flexible(model)) return 0;
+    model->flexible = !model->flexible;
+    if (model->flexible) evaluate(arm_motion, model, NULL, motion, NULL);
+    memset(motion, 0, 3 * sizeof(double));
+    memcpy(model->values + OFFSET_TOOL_DEFLECTION, motion, sizeof motion);
+    return 1;
 }
 
 static const char *check_ranges(const Model *model)
 {
+    const double frequency = model->values[OFFSET_TOOL_FREQUENCY];
+    if (frequency != 0.0 && !(frequency >= MIN_FREQUENCY && frequency <= MAX_FREQUENCY)) {
+        return "tool_frequency is neither 0 nor from 0.1 to 1e6 rad/s";
+    }
+    if (!(model->values[OFFSET_TOOL_DAMPING] < 1.0)) return "tool_damping is not below 1";
     for (size_t i = 0; i < N_JOINTS; i++) {
         const double lower = model->values[OFFSET_JOINT_LOWER + i], upper = model->values[OFFSET_JOINT_UPPER + i];
         if (!(lower < upper)) return "joint_lower is not below joint_upper";
@@ -140,6 +163,7 @@ const char *model_settle(Model *model, int *changed)
     const char *message = check_ranges(model);
     *changed = 0;
     if (message != NULL) return message;
+    *changed = match_tool(model);
     for (size_t i = 0; i < N_JOINTS; i++) {
         const int side = side_met(model, i);
         if (side != 0) {
@@ -297,14 +321,14 @@ static double count_parts(const Model *model, double step)
 const char *model_step(Model *model, double step)
 {
     const double parts = count_parts(model, step), part = step / parts;
-    const int flexible = model->values[OFFSET_TOOL_FREQUENCY] > 0.0;
     double before[6], after[6];
     if (part != model->gain_step) refresh_gains(model, part); /* also after a parameter was set */
-    if (flexible) evaluate(arm_motion, model, NULL, after, NULL);
+    (void)match_tool(model);
+    if (model->flexible) evaluate(arm_motion, model, NULL, after, NULL);
     for (double done = 0.0; done < parts; done += 1.0) {
         const char *message = move_joints(model);
         if (message != NULL) return message;
-        if (!flexible) continue;
+        if (!model->flexible) continue;
         memcpy(before, after, sizeof before);
         evaluate(arm_motion, model, NULL, after, NULL);
         swing_tool(model, part, before, after);

@@ -31,6 +31,7 @@ typedef struct {
     int exchange;                /* a solver integrates the model: joints are held and freed at events only */
     int held[N_JOINTS];          /* 1 by its upper stop, -1 by its lower one, 0 free */
     int reported[N_JOINTS];      /* values of `held` in the last log messages */
+    int flexible;                /* whether the tool was, at the last step or event */
     int stale;                   /* which computed values are out of date */
 } Model;
 

@@ -132,10 +132,13 @@ class FmuController(Controller):
         del seed
         if not self._fresh:
             self._instance.reset()
+        self._begin(observation.time)
+
+    def _begin(self, time: float) -> None:
+        self._fresh = False
         for act in self._setters:
             act(self._instance, 0)
-        self._instance.start(observation.time)
-        self._fresh = False
+        self._instance.start(time)
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """Return the output of the FMU for this instant.
@@ -181,6 +184,8 @@ class FmuController(Controller):
         """
         if not isinstance(state, bytes):
             raise TypeError(f"state must come from save, got {type(state).__name__}")
+        if self._fresh:
+            self._begin(0.0)
         self._instance.restore_bytes(state)
 
 

@@ -20,6 +20,8 @@ from servobench.plant.contract.settings import NonNegative, Positive, ShareBelow
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
 
 MAX_PART: Final = 0.005  # [s] over which play is updated once and the acceleration of a tool changes linearly
+# [rad/s] of a flexible tool: the closed form of its motion loses its digits below, and overflows far above.
+FREQUENCIES: Final = (0.1, 1e6)
 Motion: TypeAlias = tuple[FloatArray, FloatArray]
 """p [m] and ṗ [m/s], (..., 3) each."""
 
@@ -45,6 +47,12 @@ class MechanicsConfig:
     """[rad/s] ω, natural frequency of a flexible tool; 0: rigid."""
     tool_damping: ShareBelowOne = 0.02
     """[1] ζ, its damping ratio."""
+
+    def __post_init__(self) -> None:
+        """Check the frequency."""
+        low, high = FREQUENCIES
+        if self.tool_frequency != 0.0 and not low <= self.tool_frequency <= high:
+            raise ValueError(f"tool_frequency must be 0 or from {low:g} to {high:g}, got {self.tool_frequency:g}")
 
     @property
     def geared(self) -> bool:

@@ -28,10 +28,10 @@ INPUTS = 0  # value reference of the first input
 class Loaded(Driven):
     """A controller with all its inputs and all its outputs at once."""
 
-    def __init__(self, name: str, version: int) -> None:
+    def __init__(self, name: str, version: int, time: float = 0.0) -> None:
         super().__init__(exported(name, version), version)
         self.outputs = self.references("joint_velocity_command")
-        self.start()
+        self.start(time)
 
     def set(self, values) -> None:
         self.write(values, "joint_position", "feature", "seen", "reference")
@@ -119,6 +119,18 @@ def test_short_steps_take_a_sample_a_period_and_a_long_one_takes_several():
         controller.set(inputs[0])
         controller.step(0.0, 3 * PERIOD)
         np.testing.assert_allclose(controller.get(), other.get(), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("first", "step"), [(1.7e9, PERIOD), (0.0, PERIOD * (1.0 - 5e-7))])
+def test_time_that_is_a_sum_of_steps_misses_no_sample(first, step):
+    inputs, commands = original("ukf_mfac:published")
+    with Loaded("ukf_mfac:published", 2, first) as controller:
+        time = first
+        for values, command in zip(inputs, commands, strict=True):
+            controller.set(values)
+            np.testing.assert_allclose(controller.get(), command, rtol=0, atol=1e-6)  # a time has 10 digits before s
+            controller.step(time, step)
+            time += step
 
 
 @pytest.mark.parametrize("step", [1e6, 1e300])

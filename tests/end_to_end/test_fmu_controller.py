@@ -75,6 +75,10 @@ def test_a_mapping_names_the_variables_and_a_saved_state_goes_on_with_equal_bits
     controller.restore(saved[1])
     _, again = go(observation, 20, 40)
     np.testing.assert_array_equal(again, straight)
+    plant.restore(saved[0])
+    controller = build(resolve(request, Settings())).controller  # a new one, which goes on and begins anew
+    controller.restore(saved[1])
+    np.testing.assert_array_equal(go(observation, 20, 40)[1], straight)
     observation = plant.reset(0)
     controller.reset(observation, 0)
     np.testing.assert_array_equal(go(observation, 0, 20)[1], first)

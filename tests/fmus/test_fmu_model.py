@@ -1,9 +1,11 @@
 """The exported UR5 as a model: agreement with numpy and fmpy, derivatives, saved states, reset, refusals."""
 
+import ctypes
 import pickle
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -28,10 +30,10 @@ VERSIONS = [2, 3]
 class Opened:
     """An instance of the exported FMU, for calls below the plant."""
 
-    def __init__(self, version: int, start: bool = True) -> None:
+    def __init__(self, version: int, start: bool = True, log: Path | None = None) -> None:
         path = cached_fmu(version)
         self.description = read_description(path, extract_fmu(path))
-        self.instance = open_instance(self.description)
+        self.instance = open_instance(self.description, None, log)
         if start:
             self.instance.start(0.0)
 
@@ -280,6 +282,46 @@ def test_the_fmu_refuses_what_makes_no_sense(version):
         opened.set("joint_lower", 10.0)
         with pytest.raises(FmuError, match="joint_lower is not below joint_upper"):
             opened.instance.start(0.0)
+    for name, value in (("tool_frequency", 1e-4), ("tool_frequency", 1e160), ("tool_damping", 1.0)):
+        with Opened(version) as opened:
+            opened.set(name, value)
+            with pytest.raises(FmuError, match=f"{name} is n"):
+                opened.instance.stepper(0.05)(0.0)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_tool_made_rigid_or_flexible_within_a_run_is_where_a_rigid_one_is(version):
+    with Opened(version) as opened:
+        advance = opened.instance.stepper(0.05)
+        opened.set("joint_velocity_command", 0.3)
+        for k in range(10):
+            advance(k * 0.05)
+        opened.set("tool_frequency", 30.0)
+        advance(0.5)  # at a constant speed, which the tool has already
+        speed = np.linalg.norm(opened.get("tool_velocity"))
+        assert speed > 0.1
+        assert np.linalg.norm(opened.get("tool_deflection")) < 0.1 * speed / 30.0
+        opened.set("joint_velocity_command", -0.3)
+        advance(0.55)
+        assert np.linalg.norm(opened.get("tool_deflection")) > 1e-3
+        opened.set("tool_frequency", 0.0)
+        advance(0.6)
+        assert not opened.get("tool_deflection", "tool_velocity").any()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_only_the_categories_of_the_last_call_are_logged(version, tmp_path):
+    with Opened(version, log=tmp_path / "log") as opened:
+        opened.set("joint_lower", opened.get("joint_position") - 0.01)
+        advance, flag = opened.instance.stepper(0.05), ctypes.c_int if version == 2 else ctypes.c_bool
+        found = []
+        for k, (on, category) in enumerate([(1, b"logStatusWarning"), (1, b"logEvents"), (0, b"logStatusWarning")]):
+            opened.instance.call("SetDebugLogging", flag(on), ctypes.c_size_t(1), (ctypes.c_char_p * 1)(category))
+            opened.set("joint_velocity_command", -1.0 if k < 2 else 1.0)
+            advance(k * 0.05)
+            found.append((tmp_path / "log").read_text())
+    assert ["is held" in text for text in found] == [False, True, True]
+    assert found[2] == found[1]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -77,6 +77,12 @@ def test_a_flexible_tool_answers_a_step_of_acceleration_as_a_second_order_system
     np.testing.assert_allclose(tool.velocity, one.velocity, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("frequency", [1e-4, 0.09, 2e6])
+def test_a_frequency_whose_closed_form_has_no_digits_is_refused(frequency):
+    with pytest.raises(ValueError, match="tool_frequency must be 0 or from 0.1 to 1e.06, got"):
+        MechanicsConfig(tool_frequency=frequency)
+
+
 def test_a_flexible_tool_answers_a_changing_acceleration_exactly():
     mechanics = MechanicsConfig(tool_frequency=12.0, tool_damping=0.1)
     time = np.linspace(0.0, 0.3, 30001)
