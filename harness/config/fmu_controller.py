@@ -29,7 +29,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.mapping import STEP_TOLERANCE, read_mapping
+from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_inputs, check_unit, read_mapping
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -82,7 +82,7 @@ class FmuController(Controller):
         """
         self._description = read_sized(mapping.file, mapping.parameters)
         self._period, self._shape = knowledge.spec.period, (knowledge.spec.m, knowledge.spec.n)
-        self._rows = self._check(mapping, knowledge.preview)
+        self._rows = self._check(mapping, knowledge.preview, knowledge.spec.feature_unit)
         self._setters = setters(self._description, mapping.parameters)
         self._instance = open_instance(self._description, mapping.tolerance, mapping.debug_log)
         weakref.finalize(self, self._instance.close)
@@ -94,8 +94,8 @@ class FmuController(Controller):
         self._advance = self._instance.stepper(self._period)
         self._fresh = True
 
-    def _check(self, mapping: ControllerMapping, preview: int) -> int:
-        """Return how many rows of the reference it takes, and refuse sizes that do not fit."""
+    def _check(self, mapping: ControllerMapping, preview: int, feature_unit: str) -> int:
+        """Return how many rows of the reference it takes, and refuse sizes and units that do not fit."""
         (m, n), file = self._shape, self._description.path.name
         roles = ("outputs", "features", "joints", "seen", "jacobian", "reference")
         found = {role: self._description.select(getattr(mapping, role), role, NUMERIC) for role in roles}
@@ -103,14 +103,12 @@ class FmuController(Controller):
             came = total_size(found[role])
             if found[role] and came != size:
                 raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
-        taken: dict[str, str] = {}
-        for role in ("joints", "features", "seen", "reference"):
-            for variable in found[role]:
-                if variable.causality != "input":
-                    raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
-                if (other := taken.setdefault(variable.name, role)) != role:
-                    both = f"{role} and {other} both name the input {variable.name!r}"
-                    raise ValueError(f"{file}: {both}; each has its own")
+        given = {role: found[role] for role in ("joints", "features", "seen", "reference")}
+        check_inputs(given, self._description)
+        units = {"outputs": "rad/s", "joints": "rad", "features": feature_unit, "reference": feature_unit}
+        for role, unit in units.items():
+            check_unit(role, found[role], unit)
+        taken = {variable.name for variables in given.values() for variable in variables}
         inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
         if idle := [name for name in inputs if name not in taken]:
             remark(f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value")

@@ -231,7 +231,8 @@ def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's v
     size = prod(each for _, each in axes)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
-    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, variable.unit or "")
+    unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
+    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, unit)
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above

@@ -9,7 +9,7 @@
 The keys are the fields of `FmuMapping`, its sections the fields of their own classes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar, cast
@@ -32,8 +32,8 @@ from servobench.plant.contract.settings import (
     settings,
 )
 from servobench.plant.contract.signals import PlantSpec
-from servobench.plant.contract.units import UNITS
-from servobench.plant.fmu.description import FmuDescription, total_size
+from servobench.plant.contract.units import SPELLINGS, UNITS
+from servobench.plant.fmu.description import FmuDescription, Variable, total_size
 
 Roles = TypeVar("Roles")
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
@@ -169,9 +169,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
             f"must be one, got {step:g} s"
         )
     inputs, features = description.select(mapping.inputs, "inputs"), description.select(mapping.features, "features")
-    for variable in inputs:
-        if variable.causality != "input":
-            raise ValueError(f"inputs names {variable.name!r}, which is of causality {variable.causality}")
+    check_inputs({"inputs": inputs}, description)
+    check_unit("inputs", inputs, "rad/s")
     given = mapping.names.feature_unit
     for variable in features:
         if variable.unit != given and {variable.unit, given} <= UNITS["m"].keys():
@@ -190,7 +189,9 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("truth.jacobian", truth.jacobian, n * m),
         ("truth.states", truth.states, n),
     ):
-        came = total_size(description.select(names, name))
+        came = total_size(found := description.select(names, name))
+        if name in {"joints", "truth.states"}:
+            check_unit(name, found, "rad")
         if names and came != size:
             raise ValueError(f"{name} must name {size} numbers for {n} inputs and {m} features, got {came}")
     return PlantSpec.of_joints(
@@ -202,6 +203,36 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         period,
         mapping.names.feature_unit,
     )
+
+
+def check_inputs(roles: Mapping[str, Iterable[Variable]], description: FmuDescription) -> None:
+    """Refuse variables by role that are no inputs, or that are named twice.
+
+    Raises:
+        ValueError: names the variable.
+    """
+    taken: dict[str, str] = {}
+    for role, variable in ((role, variable) for role, variables in roles.items() for variable in variables):
+        if variable.causality != "input":
+            raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
+        if (other := taken.get(variable.name)) is not None:
+            how = "twice" if other == role else f"as {other} does; each has its own"
+            raise ValueError(f"{description.path.name}: {role} names the input {variable.name!r} {how}")
+        taken[variable.name] = role
+
+
+def check_unit(role: str, variables: Iterable[Variable], own: str) -> None:
+    """Refuse variables that the FMU declares in another unit of the same quantity.
+
+    Raises:
+        ValueError: names the variable and its unit.
+    """
+    for variable in variables:
+        unit = variable.unit.translate(SPELLINGS)
+        if unit != own and unit in UNITS.get(own, {}):
+            raise ValueError(
+                f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: convert it in the FMU"
+            )
 
 
 def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:

@@ -10,6 +10,8 @@ from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe_with, mapping
 
 FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
+TYPES = '<TypeDefinitions><SimpleType name="Rate"><Real unit="deg/s"/></SimpleType></TypeDefinitions><ModelVariables>'
+IN_DEGREES = describe_with(2, "<ModelVariables>", TYPES).replace('<Real start="0.0"/>', '<Real declaredType="Rate"/>')
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
 
 
@@ -87,6 +89,7 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, mo
     [
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
         (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
+        (2, {"description": IN_DEGREES}, "", "inputs names 'push.slew', whose unit is deg/s; wanted rad/s"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
         (3, {"description": describe_with(3, 'start="2"', 'start="3"')}, "",
          "reading wheel[1], wheel[2], wheel[3], … returned"),

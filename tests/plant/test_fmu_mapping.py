@@ -100,6 +100,26 @@ def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given
         mapping_spec(mapping, described, 0.05)
 
 
+@pytest.mark.parametrize(("role", "unit", "wanted"), [("v", "deg/s", "rad/s"), ("q", "°", "rad")])
+def test_degrees_of_the_fmu_are_refused(tmp_path, role, unit, wanted):
+    units = {"v": "rad/s", "q": "rad", "y": "m"} | {role: unit}
+    variables = (
+        Variable("v", 0, 1, "input", unit=units["v"]),
+        Variable("q", 1, 1, "output", unit=units["q"]),
+        Variable("y", 2, 1, "output", unit=units["y"]),
+    )
+    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
+    with pytest.raises(ValueError, match=f"names '{role}', whose unit is deg.*wanted {wanted}: convert it in the FMU"):
+        mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
+
+
+def test_an_input_that_is_named_twice_is_refused(tmp_path):
+    variables = Variable("v", 0, 1, "input"), Variable("y", 1, 1, "output")
+    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
+    with pytest.raises(ValueError, match="a.fmu: inputs names the input 'v' twice"):
+        mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v", "v"), ("y",)), described, 0.05)
+
+
 def test_features_that_are_the_joints_are_remarked_on(tmp_path, caplog):
     remark.cache_clear()
     variables = Variable("v", 0, 1, "input"), Variable("q", 1, 1, "output"), Variable("y", 2, 1, "output")
