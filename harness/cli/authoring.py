@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import keyword
+import os
 import re
 import sys
 from functools import partial
@@ -17,7 +18,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import write_atomically, write_csv
+from servobench.plant.contract.files import user_path, write_atomically, write_csv
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -171,7 +172,7 @@ def identify(
     from servobench.harness.run.preflight import mistakes
     from servobench.harness.run.request import find_sensing
     from servobench.harness.run.twin_file import estimates, remarks, twin_text
-    from servobench.plant.robot.catalogue import ROBOTS, find_robot
+    from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
     try:
         resolved, table = _logged(log, run, IDENTIFYING, (robot, sensing), out)
@@ -195,7 +196,12 @@ def identify(
         say(line)
     if out is not None:
         with writing(out):
-            text = twin_text(found, rows, response, (request.robot, request.sensing))
+            folder = out.resolve().parent  # where the twin looks for files first
+            named = with_files(
+                request.robot,
+                lambda file: os.path.relpath(user_path(file), folder) if user_path(file).is_file() else file,
+            )
+            text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
         say(f"twin in {out}; the next command: servobench compare --robot {out} --plants kinematic")
 

@@ -140,7 +140,7 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     found = {name: value for name, (value, deviation) in ((name, robot.estimate(name)) for name in EXTRAS)
              if abs(value) > CERTAIN * deviation}  # fmt: skip
     mechanics: dict[str, float] = {name: abs(found[name]) for name in ("backlash", "ripple") if name in found}
-    mechanics |= {"tool_frequency": found["compliance"] ** -0.5} if found.get("compliance", 0.0) > 0.0 else {}
+    mechanics |= {"tool_frequency": found["compliance"] ** -0.5} if found.get("compliance", 0.0) > 1e-12 else {}
     sensing = {"camera_turn": found["turning"]} if found.get("turning", 0.0) > 0.0 else {}
     swing = math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0))
     spread, steady, kept = _lateness(log, robot)

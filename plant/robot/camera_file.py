@@ -7,6 +7,7 @@ The file is a TOML with the keys of `CameraFile`, or the intrinsics alone: a `ca
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -41,6 +42,7 @@ INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in file
     "distortion": ("distortion_coefficients", "distCoeffs", "dist_coeffs", "d", "D"),
     "distortion_model": ("distortion_model",),
 }
+EXPONENT: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 Row = tuple[Number, ...]
 
 
@@ -215,13 +217,17 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     import yaml  # noqa: PLC0415 - few runs have such a file
 
     class Loader(yaml.SafeLoader):
-        """Reads OpenCV's matrices as mappings."""
+        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05, which are texts in YAML 1.1."""
 
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+.0123456789"))
     tag = "tag:yaml.org,2002:opencv-matrix"
     Loader.add_constructor(tag, lambda loader, node: loader.construct_mapping(node, True))  # type: ignore[arg-type]
     text = read_text("file", path)
+    if text.lstrip().startswith("<"):
+        raise ValueError(f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml")
     try:
-        found: Any = yaml.load(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
+        documents = yaml.load_all(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
+        found: Any = next(documents, None)  # `ros2 topic echo` puts --- after each message
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
     keys = dict[str, Any]()

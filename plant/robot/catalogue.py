@@ -70,6 +70,13 @@ def _changed(kind: str, path: Path) -> int:
         raise ValueError(f"{kind} file {path} cannot be read: {error.strerror}") from error
 
 
+def with_files(text: str, change: Callable[[str], str]) -> str:
+    """Return the text of a robot with the paths of robot and camera, or its name, changed."""
+    robot, separator, camera = text.partition(WITH)
+    file, mark, link = robot.partition("#")
+    return change(file) + mark + link + separator + (change(camera) if camera else "")
+
+
 @cache
 def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
     del changed
@@ -92,8 +99,13 @@ def _read(text: str, changed: int) -> Robot:
     values = read_toml("robot file", path)
     if "robot" not in values:
         return files.read_dh_robot(path, values)
-    if (named := str(values["robot"])) == text or (robot := find_robot(named)).twin is not None:
+    named = with_files(
+        str(values["robot"]), lambda file: str(beside if (beside := path.parent / file).is_file() else file)
+    )
+    base = user_path(named.partition(WITH)[0])
+    if base.suffix.lower() == ".toml" and "robot" in read_toml("robot file", base):
         raise ValueError(f"twin {path}: its robot must be the one that controllers know, got the twin {named}")
+    robot = find_robot(named)
     twin = read_twin(path, values, robot.arm)
     return replace(robot, name=path.stem, title=f"{robot.title} twin", source=path.name, twin=twin)
 

@@ -274,9 +274,9 @@ def _way(link: str, above: dict[str, Any]) -> list[Any]:
 def _flange(ways: dict[str, list[Any]]) -> str:
     """Return the link that is fixed to the last of the most rotating ones; that one itself if there is none."""
     last = max(ways, key=lambda name: (sum(map(_turns, ways[name])), bool(ways[name]) and _turns(ways[name][-1])))
-    # Fingers and cameras follow after the flange.
+    # Fingers and cameras follow after the flange; ROS puts the frame of a force sensor before it.
     fixed = [name for name, way in ways.items() if way and way[:-1] == ways[last] and way[-1].type == "fixed"]
-    return fixed[0] if fixed else last
+    return "flange" if "flange" in fixed else fixed[0] if fixed else last
 
 
 def _along(axis: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.twin_file import estimates, remarks, sensor, twin_text
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 
@@ -364,12 +365,16 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
     assert abs(wanted[ELBOW]) > 1.0
 
 
-def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path):
+def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path, monkeypatch):
     _, table, _ = logged()
-    log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
+    log, out = tmp_path / "robot.csv", tmp_path / "twins/twin.toml"
+    out.parent.mkdir()
+    write(tmp_path, text(arm_tree(find_robot(ROBOT).arm, find_robot(ROBOT))), "arm.urdf")
+    monkeypatch.chdir(tmp_path)
     table.drop(columns=[name for name in table if name.startswith("true_")]).to_csv(log, index=False)
-    assert "gear_elbow" in output_of("identify", log, "--robot", ROBOT, "--out", out)
-    assert out.read_text(encoding="utf-8").startswith(f'robot = "{ROBOT}"')
+    assert "gear_elbow" in output_of("identify", log, "--robot", "arm.urdf", "--out", out)
+    assert out.read_text(encoding="utf-8").startswith('robot = "../arm.urdf"')
+    monkeypatch.chdir(out.parent)
     row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row
     assert row["outcome"] == "settled"
 

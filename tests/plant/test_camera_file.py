@@ -130,8 +130,8 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
     storage.write("camera_matrix", K)
     storage.write("distortion_coefficients", np.array([D]))
     storage.release()
-    topic = "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [0.12, -0.25, 0.002, -0.001, 0.08]\n"
-    topic += "k: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
+    topic = "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [12e-2, -0.25, 0.002, -0.001, 0.08]\n"
+    topic += "k: [6.15e2, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n---\n"
     named = write(f'intrinsics = "ros.yaml"\nrate = 30\n{ON_FLANGE}', "named.toml")
     flat = write(CAMERA.replace("[[", "[").replace("]]", "]").replace("], [", ", "), "flat.toml")
     for path in (

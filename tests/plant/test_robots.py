@@ -301,6 +301,11 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
     oracle.update_cfg({f"joint_{i}": value for i, value in enumerate(q.tolist(), 1)})
     np.testing.assert_allclose(flange(read.arm, q), oracle.get_transform("hand", "foot")[:3, 3], atol=1e-9)
     np.testing.assert_array_equal(read.limits.upper, [2.5, 1.5, 2.5, 2.5])
+    sensor = '<link name="force"/><joint name="force_joint" type="fixed"><parent link="link_4"/><child link="force"/>'
+    hand = f'{sensor}<origin rpy="3.14159 0 0"/></joint><link name="flange"/>'
+    renamed = odd_urdf().replace('<link name="hand"/>', hand).replace('link="hand"', 'link="flange"')
+    ros = find_robot(str(write(tmp_path, renamed, "ros.urdf")))
+    np.testing.assert_allclose(ros.arm.frames(q)[-1], read.arm.frames(q)[-1], atol=1e-12)
     with pytest.raises(ValueError, match="has no link 'hnd'"):
         find_robot(f"{path}#hnd")
     with pytest.raises(ValueError, match="no chain of at least three turning joints"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kit.own import assert_remarks, write
+from kit.robots import FOUR_JOINTS
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build, build_together, draw_robot
 from servobench.harness.run.request import RunRequest
@@ -11,7 +12,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.signals import Command
-from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.catalogue import find_robot, with_files
 from servobench.plant.robot.twin import deviated
 
 TWIN = """
@@ -147,6 +148,23 @@ def test_a_twin_of_a_twin_is_refused(twin, tmp_path):
     other = write(tmp_path, TWIN.replace("ur10e", twin), "other.toml")
     with pytest.raises(ValueError, match="its robot must be the one that controllers know"):
         find_robot(str(other))
+
+
+def test_twins_of_each_other_are_refused(tmp_path):
+    first, second = (write(tmp_path, TWIN.replace("ur10e", f"{name}.toml"), f"{other}.toml")
+                     for name, other in (("a", "b"), ("b", "a")))  # fmt: skip
+    for path in (first, second):
+        with pytest.raises(ValueError, match="its robot must be the one that controllers know"):
+            find_robot(str(path))
+
+
+def test_a_twin_finds_its_robot_beside_itself(tmp_path, monkeypatch):
+    write(tmp_path, FOUR_JOINTS, "arm.toml")
+    own = TWIN.replace("ur10e", "arm.toml").replace("elbow", "joint_3")
+    path = written(tmp_path, own)
+    monkeypatch.chdir(tmp_path.parent)
+    assert find_robot(path).n == 4
+    assert with_files("my arm.urdf#tool0 with camera.toml", str.upper) == "MY ARM.URDF#tool0 with CAMERA.TOML"
 
 
 @pytest.mark.parametrize("mismatch", ["moderate", "tool=20mm"])
