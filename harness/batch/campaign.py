@@ -279,7 +279,8 @@ def _carry_out_missing(
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out the runs whose part is not in the folder; yield each block with its results."""
     begin, end = (len(campaign.cells) * number // how.part[1] for number in (how.part[0] - 1, how.part[0]))
-    done = [each for each in results.finished_runs(folder) if begin <= each.start < end]
+    there = (range(max(each.start, begin), min(each.stop, end)) for each in results.finished_runs(folder))
+    done = list(filter(None, there))  # a block of another part may reach over the borders
     missing = end - begin - sum(map(len, done))
     how.observer.begin(end - begin, end - begin - missing)
     ends = [range(begin, begin), *done, range(end, end)]
@@ -291,7 +292,7 @@ def _carry_out_missing(
 
 
 def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: bool) -> None:
-    """Refuse assignments to settings that are read but change nothing here.
+    """Refuse assignments and variations of settings that are read but change nothing here.
 
     Args:
         settings: overrides of the defaults.
@@ -301,27 +302,40 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
     Raises:
         ConfigurationError: names the first of them and says why.
     """
-    for section, name, text in settings.assigned:
+    for section, name, words in _given(settings, examples):
         key, why = f"{section}.{name}", ""
         own = [run for run in examples if section in ("run", run.plant, run.controller, run.task)]
-        if own and all(run.varies(key) for run in own):
-            why = f"all runs vary {key}"
-        elif key == "run.full_jacobian" and not steps:
+        if key == "run.full_jacobian" and not steps:
             why = "this command keeps no steps, which hold the Jacobians"
         elif key == "run.camera_moves_at" and not any(run.mismatch.size("camera_move") for run in examples):
             why = "no mismatch moves the camera, as camera_move=90deg does"
+        elif words.startswith("--set") and own and all(run.varies(key) for run in own):
+            why = f"all runs vary {key}"
         if why:
-            raise ConfigurationError(f"--set {text} has no effect: {why}")
+            raise ConfigurationError(f"{words} has no effect: {why}")
 
 
-def _remark_on_idle(settings: Settings, runs: Iterable[ResolvedRun]) -> None:
-    """Remark on assignments to settings that count only together with another one."""
-    used = [(run.request.plant, run.plant) for run in runs] + [(run.request.controller, run.controller) for run in runs]
-    for section, key, text in settings.assigned:
+def _remark_on_idle(settings: Settings, runs: Sequence[ResolvedRun]) -> None:
+    """Remark on assignments to settings and variations that count only together with another setting."""
+    for section, key, words in _given(settings, [run.request for run in runs]):
         name, idle = NEEDED.get(key, ("", ()))
-        values = [flatten(config).get(name) for part, config in used if part == section]
+        used = [
+            getattr(run, role)
+            for run in runs
+            for role in ("plant", "controller")
+            if section == getattr(run.request, role) or (section == role and run.request.varies(f"{role}.{key}"))
+        ]
+        values = [flatten(config).get(name) for config in used] if name else []
         if values and all(value in idle for value in values):
-            remark(f"--set {text} has no effect while {section}.{name} is {values[0]}")
+            remark(f"{words} has no effect while {section}.{name} is {values[0]}")
+
+
+def _given(settings: Settings, examples: Iterable[RunRequest]) -> list[tuple[str, str, str]]:
+    """Return section, key and words of assignments and, by role, of settings that some of the runs vary."""
+    varied = dict.fromkeys(key for run in examples for key, _ in run.varied)
+    assigned = [(section, key, f"--set {text}") for section, key, text in settings.assigned]
+    parts = (key.partition(".") for key in varied)
+    return [*assigned, *((role, name, f"varying {role}.{name}") for role, _, name in parts)]
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

@@ -24,7 +24,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.units import split_quantity
+from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
 MAX_SEEDS: Final = 1_000_000  # of a batch
@@ -289,13 +289,31 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
     numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
     if numeric and any(isinstance(each, float) for each in values):
         values = [float(each) for each in values]
-    found = tuple(values)
+    found = _in_one_way(name, values)
     if not found or "" in found:
         raise ConfigurationError(f"--vary {name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2")
+    sizes = [_size(each) for each in found]
     for k, each in enumerate(found):
-        if each in found[:k]:
+        if sizes[k] in sizes[:k]:
             raise ConfigurationError(f"--vary {name} names {each} twice")
     return found
+
+
+def _in_one_way(name: str, values: Sequence[Any]) -> tuple[Value, ...]:
+    """Return values that are all numbers or all texts, so that a column has one type; 0 has any unit."""
+    texts = [each for each in values if isinstance(each, str)]
+    unit = next((parts[1] for parts in map(split_quantity, texts) if parts), "")
+    found = tuple(f"0{unit}" if texts and unit and each == 0 else each for each in values)
+    if texts and not all(isinstance(each, str) for each in found):
+        raise ConfigurationError(f"--vary {name} mixes numbers and texts; write the unit with all values, or with none")
+    return found
+
+
+def _size(value: Value) -> object:
+    """Return a value, a quantity in an own unit of its own, by which 2s and 2000ms are equal."""
+    parts = split_quantity(value) if isinstance(value, str) else None
+    own = next((own for own, units in UNITS.items() if parts and parts[1] and parts[1] in units), "")
+    return (own, round(in_own_unit(*parts, own), 12)) if parts and own else value
 
 
 @dataclass

@@ -26,7 +26,7 @@ from servobench.harness.batch import tables
 from servobench.harness.batch.lock import LOCK, PARTS, check_empty, refuse_links
 from servobench.harness.batch.tables import DamagedFile, refuse_lacking, refuse_nameless, sums_of, writing
 from servobench.harness.config.description import plain
-from servobench.harness.run.result import RunResult, log_entry
+from servobench.harness.run.result import NETWORKS, RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, write_atomically
@@ -138,7 +138,7 @@ def part_names(folder: Path, kind: str) -> list[str]:
 
 
 def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
-    """Copy parts, each of a folder and beginning with a run, and the pictures of their runs into another folder.
+    """Copy parts, each of a folder and beginning with a run, with pictures of their runs and networks into another one.
 
     Raises:
         ConfigurationError: a file of them is damaged.
@@ -152,10 +152,12 @@ def copy_parts(parts: Iterable[tuple[Path, int]], other: Path) -> None:
         if (folder / PICTURES).is_dir():
             runs = tables.read_tables(folder, [part_name(index, RUNS)], columns=("run_id",))["run_id"]
             names = [name for run in runs if (folder / (name := f"{PICTURES}/{run}.png")).is_file()] + names
+        names += [f"{NETWORKS}/{path.name}" for path in sorted((folder / NETWORKS).glob("*.npz"))]
         files |= {name: partial(shutil.copyfile, folder / name) for name in names}
     with writing(other):
-        if any(name.startswith(PICTURES) for name in files):
-            (other / PICTURES).mkdir(exist_ok=True)
+        for name in (PICTURES, NETWORKS):
+            if any(file.startswith(name) for file in files):
+                (other / name).mkdir(exist_ok=True)
         write_vouched(other, files)
 
 

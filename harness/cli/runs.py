@@ -139,8 +139,8 @@ def train(
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
-    from servobench.harness.run.knowledge import NETWORKS
     from servobench.harness.run.resolution import check_settings
+    from servobench.harness.run.result import NETWORKS
     from servobench.plant.contract.cache import cache_folder
 
     settings, controller = overrides.settings(), selection.choose("controllers", controller)

@@ -224,12 +224,13 @@ def tune(
     names = selection.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     with configuration_errors():
         runs = TuningSet(selection.split("plants", plants), robots, offset)
+        second = runs.second()
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
         if check:
-            _check(out, names, runs.second(), opened)
+            _check(out, names, second, opened)
             return
         say(f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less")
         methods = open_methods(out, plan)

@@ -351,7 +351,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             ConfigurationError: a number, name, setting or mismatch that cannot be used, or a plant that carries out
                 one run at a time.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ConfigurationError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
         if choice.get("render_mode") is not None:
             raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
@@ -363,7 +363,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
                 f"plant {self._resolved.request.plant} carries out one run at a time: "
                 "gymnasium.make_vec(..., vectorization_mode='async')"
             )
-        self.num_envs = num_envs
+        self.num_envs = int(num_envs)
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -392,7 +392,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             raise ConfigurationError(f"seed must be a number or a list of {count}, got {len(listed)} seeds")
         first = cast("int | None", seed if listed is None else listed[0])
         super().reset(seed=first)
-        if listed is None and first is not None and first > 2**63 - count:
+        if listed is None and first is not None and read_seed(first) > 2**63 - count:
             raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {first}")
         seeds = self.np_random.integers(SEEDS, size=count) if first is None or listed else first + np.arange(count)
         if listed is not None:
@@ -409,7 +409,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         return self._observe(), {"seed": seeds}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Hold an action in every lane for a period; see `ServoEnv.step`.
+        """Hold an action in every lane for a period; see `ServoEnv.step`, but without `reason`.
 
         Args:
             actions: (num_envs, n).
@@ -435,13 +435,13 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self._ended = not rollout.running or bool(failed.any())
         period = self._spaces.spec.period
         periods = np.where(failed, many.periods - rollout.k + 1, 1)
-        info = {"time": rollout.k * period, "error": error}
+        info = {"time": np.full(self.num_envs, rollout.k * period), "error": error}
         return self._observe(), -error * periods * period, failed, ~failed & self._ended, info
 
     @property
-    def observation(self) -> Observation:
-        """The present observation of the plant, as controllers get it; arrays have a leading axis."""
-        return self._rollout.observation
+    def observation(self) -> Observation | None:
+        """The present observation of the plant, as controllers get it, with a leading axis; None before `reset`."""
+        return None if self._many is None else self._rollout.observation
 
     def _observe(self) -> Floats32:
         return self._spaces.observe(self._rollout.observation, self._rollout.reference, self._action)

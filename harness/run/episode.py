@@ -20,7 +20,7 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import final_rows, judge_run
 from servobench.harness.run.outcome import find_outcome, pose_errors
-from servobench.harness.run.request import OWN_ROBOT, RunRequest
+from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch
 from servobench.plant.bench.bench import Bench
@@ -142,8 +142,10 @@ def _row(
     if status == COMPLETED:
         times = numbers["settling_time_s"], numbers["rms_error_evaluated"]
         outcome = find_outcome(logged, drawn.scenario, *times, drawn.final)
+    usual = spec.period == RunSettings().period
     return {
         **identity(request),
+        **({} if usual else {"period_s": spec.period}),
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,

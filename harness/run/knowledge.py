@@ -12,13 +12,13 @@ from servobench.controllers.networks.file import TrainedNetworks, load_networks,
 from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.request import RunSettings
+from servobench.harness.run.result import NETWORKS
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.lanes import one_thread
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
-NETWORKS = "networks"
 FILE = "networks.npz"
 NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes ten times longer to read
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}

@@ -197,7 +197,7 @@ def _in_name(varied: tuple[str, Value]) -> str:
     key, value = varied
     for name, short in SHORT_NAMES.items():
         if short.key == key and isinstance(value, int | float):
-            return "" if value == short.usual else f"-{name}{short.scale * value:g}{short.unit}"
+            return "" if value == short.usual else f"-{name}{short.scale * value:.12g}{short.unit}"
     return f"-{key}={value}"
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from operator import attrgetter
 from typing import Any
 
 from servobench.harness.config.registry import (
@@ -26,11 +25,18 @@ from servobench.plant.robot.twin import Twin
 
 
 class Sections(dict[str, Any]):
-    """The typed settings of a batch by section; runs that change them in the same way share one object."""
+    """The typed settings of a batch by section; runs that change them in the same way share one object.
 
-    def __init__(self, sections: Mapping[str, Any]) -> None:
+    Attributes:
+        user: overrides of the user's, which are among them.
+        given: their dotted keys by section.
+    """
+
+    def __init__(self, sections: Mapping[str, Any], user: Settings) -> None:
         """Keep settings by section."""
         super().__init__(sections)
+        self.user, self.given = user, {name: frozenset(flatten(values)) for name, values in user.sections.items()}
+        self._frames: dict[tuple[str, float], Varied] = {}
         self._changed: dict[tuple[str, Varied], Any] = {}
 
     def with_changes(self, section: str, changes: Varied) -> Any:  # noqa: ANN401 - any configuration dataclass
@@ -45,6 +51,17 @@ class Sections(dict[str, Any]):
             with configuration_errors():
                 self._changed[section, changes] = override(section, self[section], nest(dict(changes)))
         return self._changed[section, changes]
+
+    def frames(self, plant: str, robot: Robot, period: float) -> Varied:
+        """Return what changes in the sensor of a plant where a run has another period [s] than the section `run`."""
+        if period == self["run"].period or (robot.camera is None and robot.twin is None):
+            return ()
+        if (plant, period) not in self._frames:
+            config = self.user.resolve(plant, _plant_default(find_plant(plant), robot, period))
+            usual, own = flatten(self[plant]), flatten(config)
+            changes = ((key, own[key]) for key in own if key.startswith("sensing.") and own[key] != usual[key])
+            self._frames[plant, period] = tuple(changes)
+        return self._frames[plant, period]
 
 
 @dataclass(frozen=True)
@@ -95,7 +112,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
     defaults |= {name: default_config(find_controller(name), model_known=robot.known) for name in controllers}
     defaults |= {name: fitted(name, robot) for name in tasks}
-    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()})
+    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings)
 
 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass
@@ -123,14 +140,17 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
         known = "gears and tools are those of kinematic and fmu"
         raise ConfigurationError(f"plant {request.plant} has no {mechanical[0]}, as {request.mismatch} wants: {known}")
     plant, of_profile = request.varied_in("plant"), _of_profile(request, sections)
-    twin = find_robot(request.robot).twin
-    drawn = () if twin is None else _drawn_times(twin, flatten(sections[request.plant]), request.seed)
-    if both := [key for key, _ in plant if key in of_sensor]:
-        raise ConfigurationError(f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too")
+    run, robot = sections.with_changes("run", request.varied_in("run")), find_robot(request.robot)
+    frames = sections.frames(request.plant, robot, run.period)
+    drawn = () if robot.twin is None else _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
+    varied = {key: f"plant.{key} is varied" for key, _ in plant}
+    given = {key: f"{request.plant}.{key} is set" for key in sections.given.get(request.plant, ()) if key in of_sensor}
+    if of_sensor and (both := [text for key, text in (given | varied).items() if key in of_sensor]):
+        raise ConfigurationError(f"{both[0]}, and the mismatch {request.mismatch} sets it, too; leave one out")
     return ResolvedRun(
         request,
-        sections.with_changes("run", request.varied_in("run")),
-        sections.with_changes(request.plant, (*drawn, *of_profile.items(), *of_sensor.items(), *plant)),
+        run,
+        sections.with_changes(request.plant, (*frames, *drawn, *of_profile.items(), *of_sensor.items(), *plant)),
         sections.with_changes(request.controller, request.varied_in("controller")),
         sections.with_changes(request.task, request.varied_in("task")),
     )
@@ -145,19 +165,17 @@ def _drawn_times(twin: Twin, usual: Mapping[str, Any], seed: int) -> Varied:
 def _of_profile(request: RunRequest, sections: Sections) -> dict[str, float]:
     """Return the settings of the plant that come with the profile of the mismatch, by dotted key.
 
-    Those that the plant does not have, or that differ from its defaults already, are left out; so is the noise of
-    features that are found in images with a noise of their own.
+    Those that the plant does not have, or that a user gave, are left out; so is the noise of features that are found in
+    images with a noise of their own.
     """
     profile = PROFILE_SETTINGS.get(request.mismatch.profile, {})
     if not profile:
         return {}
-    config, period = sections[request.plant], sections["run"].period
-    default = _plant_default(find_plant(request.plant), find_robot(request.robot), period)
-    own = {field.name for field in fields(config)}
+    own, given = {field.name for field in fields(sections[request.plant])}, sections.given.get(request.plant, ())
     return {
         key: value
         for key, value in profile.items()
-        if key.partition(".")[0] in own and attrgetter(key)(config) == attrgetter(key)(default)
+        if key.partition(".")[0] in own and key not in given
         if "depth_noise" not in own or key != "sensing.feature_noise"
     }
 

@@ -28,6 +28,7 @@ NUMERICAL_ERROR = "numerical_error"
 CRASHED = "crashed"
 TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
+NETWORKS: Final = "networks"  # folder of trained networks, of the cache and of results
 LOST: Final = "the run killed the process that carried it out"
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more

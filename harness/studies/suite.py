@@ -54,7 +54,8 @@ def carry_out_suite(
     """
     requests = [run.request for own in runs.values() for run in own]
     check_settings(settings, [name for each in requests for name in (each.plant, each.controller, each.task)])
-    check_effects(settings, requests, steps=False)
+    for cells in runs.values():
+        check_effects(settings, [cell.request for cell in cells], steps=False)
     whole = Settings({**settings.sections, SEEING: {"image": True, **settings.sections.get(SEEING, {})}})
     resolve_sections(requests, whole)  # all challenges are checked before the first one runs
     tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)

@@ -12,7 +12,7 @@ from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import CHUNK
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.run.result import RunResult
+from servobench.harness.run.result import NETWORKS, RunResult
 from servobench.plant.contract.faults import ConfigurationError
 
 SWEEP = (
@@ -70,9 +70,20 @@ def parts(tmp_path, monkeypatch, count: int, chosen: Iterable[int]) -> list[str]
 
 def test_parts_are_merged_into_the_table_of_an_undivided_sweep(undisturbed, tmp_path, monkeypatch):
     folders = parts(tmp_path, monkeypatch, 7, range(7, 0, -1))
+    network = Path(folders[3]) / NETWORKS / "networks-0.npz"
+    network.parent.mkdir()
+    network.write_bytes(b"trained")
     assert servobench(monkeypatch, "merge", *folders, "--out", str(tmp_path / "merged")) == 0
     assert_same_runs(tmp_path / "merged", undisturbed)
+    assert (tmp_path / "merged" / NETWORKS / network.name).read_bytes() == b"trained"
     assert servobench(monkeypatch, "verify", str(tmp_path / "merged")) == 0
+
+
+def test_a_folder_that_goes_on_with_other_parts_has_each_run_once(undisturbed, tmp_path, monkeypatch):
+    folder = str(tmp_path / "out")
+    for part in ("2/3", "1/2", "3/4", "2/2"):
+        assert servobench(monkeypatch, *SWEEP, "--workers", "1", "--part", part, "--out", folder, "--resume") == 0
+    assert_same_runs(tmp_path / "out", undisturbed)
 
 
 def test_runs_of_a_part_that_is_missing_are_carried_out_in_the_merged_folder(

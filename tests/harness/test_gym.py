@@ -6,6 +6,7 @@ import re
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import DictInfoToList
 
 from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
@@ -55,6 +56,10 @@ def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
     singles = [ServoEnv(task="exp1") for _ in range(3)]
     seen, info = many.reset(seed=5)
     assert info["seed"].tolist() == [5, 6, 7]
+    listed = DictInfoToList(ServoVectorEnv(np.int64(2), task="exp1"))
+    assert listed.unwrapped.observation is None
+    assert [each["seed"] for each in listed.reset(seed=5)[1]] == [5, 6]
+    assert [each["time"] for each in listed.step(np.zeros((2, 6)))[4]] == [0.05, 0.05]
     alone = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
     np.testing.assert_array_equal(seen, alone)
     generator = np.random.default_rng(0)
@@ -214,6 +219,8 @@ def test_options_and_seeds_that_cannot_be_used_are_refused(make):
     if isinstance(env, ServoVectorEnv):
         with pytest.raises(ConfigurationError, match=re.escape("seed must be at most 2**63 - 2, got")):
             env.reset(seed=2**64)
+        with pytest.raises(ConfigurationError, match="seed must be a non-negative integer, got True"):
+            env.reset(seed=True)
         env.reset(seed=[2**63 - 1, 0])  # each lane has its own; none is counted on
     env.close()
     with pytest.raises(gymnasium.error.ResetNeeded):

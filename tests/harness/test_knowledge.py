@@ -6,7 +6,8 @@ import pytest
 from kit.toy import TRAINING, planar_jacobian, plant_spec
 from servobench.controllers.networks.fit import train
 from servobench.harness.run import knowledge as network_cache
-from servobench.harness.run.knowledge import NETWORKS, NetworkSource, keep_networks
+from servobench.harness.run.knowledge import NetworkSource, keep_networks
+from servobench.harness.run.result import NETWORKS
 from servobench.plant.contract import cache
 from servobench.plant.contract.cache import cache_folder
 

@@ -93,6 +93,25 @@ def knowledge_of(plant, needs_truth, settings, **request):
     return seen[0]
 
 
+def sensor_of(mismatch="moderate", varied=(), robot="ur5", **sections):
+    request = RunRequest("kinematic", "constant", "random", mismatch, 3, varied, robot)
+    return resolve(request, Settings(sections)).plant.sensing
+
+
+def test_a_setting_of_the_user_is_kept_beside_a_profile_also_where_it_is_the_default():
+    assert sensor_of("lab").latency > 0.0
+    assert sensor_of("lab", kinematic={"sensing": {"latency": 0.0}}).latency == 0.0
+
+
+@pytest.mark.parametrize("period", [0.005, 0.01, 0.1])
+def test_frames_fit_a_period_that_is_varied_as_one_that_is_set(tmp_path, period):
+    (tmp_path / "camera.toml").write_text("width = 640\nheight = 480\nvertical_fov = 42.5\nrate = 40.0\n")
+    robot = f"ur5 with {tmp_path / 'camera.toml'}"
+    varied, given = sensor_of(varied={"period": period}, robot=robot), sensor_of(robot=robot, run={"period": period})
+    assert varied == given
+    assert varied.frame_period == (0.025 if period < 0.025 else 0.0)
+
+
 @pytest.mark.parametrize("plant", ["kinematic", "fmu"])
 def test_a_bound_knows_the_delays_of_its_plant(plant):
     assert knowledge_of(plant, True, LATE).true_delays == Delays(0.1, 0.02, 0.03)

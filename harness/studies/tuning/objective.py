@@ -121,8 +121,20 @@ class TuningSet:
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
     def second(self) -> Self:
-        """Return the second, larger set: other robots of the tuning range, which no trial uses."""
-        return replace(self, robots=SECOND_FACTOR * self.robots, offset=(self.offset + SECOND_OFFSET) % len(TUNING))
+        """Return the second, larger set: other robots of the tuning range, which no trial uses.
+
+        Raises:
+            ValueError: the range has not that many beside those of this set.
+        """
+        own, count = len(KINDS) * self.robots, len(KINDS) * SECOND_FACTOR * self.robots
+        offset = (self.offset + SECOND_OFFSET) % len(TUNING)
+        room = (self.offset if offset < self.offset else len(TUNING)) - offset
+        if count > room or self.offset + own > offset > self.offset:
+            raise ValueError(
+                f"the tuning range of {len(TUNING)} has no room for {own} seeds from {self.offset} on, of the trials, "
+                f"and {count} from {offset} on, of the second set; take fewer robots, or the offset 0"
+            )
+        return replace(self, robots=SECOND_FACTOR * self.robots, offset=offset)
 
     def runs(self) -> list[RunRequest]:
         """Return all runs, still without a controller, the robots of a world one after the other."""
@@ -161,7 +173,9 @@ class Trial:
     def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
-        sections = Sections(resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config})
+        sections = Sections(
+            resolve_sections(requests, given := Settings(TASKS)) | {self.controller: self.config}, given
+        )
         return [select(request, sections) for request in requests]
 
     def build(self, runs: Sequence[RunRequest]) -> None:
