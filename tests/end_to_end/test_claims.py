@@ -128,6 +128,13 @@ def test_runs_that_never_settle_or_fail_count_as_slow():
     assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
 
 
+def test_the_jacobian_of_a_run_that_ended_early_is_no_error_to_compare():
+    made = tables(**BETTER)
+    mine = made[MAIN]["controller"] == PROPOSED
+    made[MAIN].loc[mine, ["status", "jacobian_error_mean"]] = ["feature_lost", 0.0]
+    assert verdicts(made)["7"] == NOT_REPRODUCED
+
+
 def test_the_medians_of_circles_come_with_the_number_of_lost_ones():
     made = tables(rms_error_evaluated=proposed(-0.015))
     lap = (made[MAIN]["task"] == CIRCLE) & (made[MAIN]["controller"] == PROPOSED)

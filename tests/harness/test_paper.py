@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 
 from kit.command import carried_out, servobench
-from servobench.harness.analysis.folder import latex_tables
+from kit.folders import sweep
+from servobench.harness.analysis.folder import latex_tables, methods_paragraph
 from servobench.harness.batch.api import compare
+from servobench.harness.batch.results import load_runs
 
 TABLE = pd.DataFrame(
     {
@@ -54,6 +56,11 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
     assert "Varied" not in text
     assert "Settings other than the defaults: exp2.duration = 2." in text
     assert "@misc{servobench," in text
+
+
+def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
+    folder = sweep(tmp_path / "sweep")
+    assert ". Varied: latency [s] 0.0, 0.05. " in methods_paragraph(folder, load_runs(folder))
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")

@@ -147,6 +147,11 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
     (title, _), *further = suite_tables(judged)
     assert title.startswith("world (no grade, as its references fail) on kinematic")
     assert not further
+    more = {"mine": [1.0] * 119, "calibrated": [-1.0] * 6 + [1.0] * 113}  # 5.04 %, which are printed as 5.0
+    (title, _), *_ = suite_tables(
+        judge(challenge("settling"), table_of(more, "settling_time_s", "point_to_point", 0.005))
+    )
+    assert title.startswith("world (no grade, as its references fail)")
     rescued = lost | {"nmpc_calibrated": [-1.0] + [1.0] * 19}  # one of the two holds on this robot
     judged = judge(challenge("settling"), table_of(rescued, "settling_time_s", "point_to_point", 0.005))
     assert {row["controller"].value for row in ranking_rows(judged)} == set(lost)

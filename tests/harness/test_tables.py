@@ -87,6 +87,12 @@ def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
     assert (row["runs lost"], row["P(A better)"][:4]) == ("0 : 4", "0.50")
 
 
+def test_the_last_table_of_a_comparison_has_no_time_of_runs_that_ended_early(runs):
+    early = runs.assign(status="feature_lost", settling_time_s=0.3)
+    ((_, table),) = summary_tables(early)
+    assert set(table["settling time [s]"]) == {"–"}
+
+
 def test_of_a_measure_without_a_good_direction_the_verdict_is_less_or_more(runs):
     runs["max_joint_position_rad"] = np.where(runs["controller"] == "quick", 1.0, 2.0) + 0.001 * runs["seed"]
     (_, _), (_, pairs) = statistics_tables(runs, "max_joint_position_rad")
