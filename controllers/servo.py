@@ -152,6 +152,7 @@ class Servo:
                 f"{J.tolist()}"
             )
         u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
+        u = self.law.restrained(law, wanted, u)
         law = self.law.noted(law, u, limited)
         if self.predictor is not None:
             predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)

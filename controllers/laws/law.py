@@ -55,6 +55,17 @@ class Law(ABC, Generic[State]):
             RunFault: it cannot go on in at least one lane.
         """
 
+    def restrained(self, state: State, wanted: FloatArray, joint_velocity: FloatArray) -> FloatArray:
+        """Return the velocity to send, (..., n), rad/s; a law that limits the change of its commands overrides this.
+
+        Args:
+            state: after the command of this period.
+            wanted: that command, (..., n), rad/s.
+            joint_velocity: what the stages that follow made of it, (..., n), rad/s.
+        """
+        del state, wanted
+        return joint_velocity
+
     def noted(self, state: State, joint_velocity: FloatArray, limited: BoolArray) -> State:
         """Return the state after a velocity left the chain; a law that remembers its commands overrides this.
 

@@ -81,6 +81,24 @@ def test_a_moving_reference_is_followed_with_a_tenth_of_a_period_of_lag():
     assert following_error(feedforward=False) > 0.0075
 
 
+@pytest.mark.parametrize("aids", [{}, {"feedforward": True}, {"posture": False}])
+def test_the_command_that_is_sent_keeps_the_acceleration_limit_of_the_law(aids):
+    config, knowledge = (
+        METHODS["ukf_mpc"].config(),
+        dataclasses.replace(KNOWLEDGE, region=(np.zeros(N), np.full(N, 2.0))),
+    )
+    law = dataclasses.replace(config.law, joint_acceleration_limit=2.0, use_preview="feedforward" not in aids)
+    config = dataclasses.replace(config, law=law, aids=dataclasses.replace(config.aids, **aids))
+    arm, servo, sent = ToyArm(np.eye(M), RESPONSE), METHODS["ukf_mpc"].build(config, knowledge), [np.zeros(N)]
+    observation, reference = arm.observe(), 0.1 * np.outer(np.arange(1.0 + PREVIEW), [1.0, 0.5, 0.0])
+    servo.reset(observation, 0)
+    for _ in range(30):
+        sent.append(servo.step(observation, reference).joint_velocity)
+        observation = arm.step(sent[-1])
+        assert servo.diagnostics()["solver_success"] == 1.0
+    assert np.abs(np.diff(sent, axis=0)).max() == pytest.approx(2.0 * PERIOD, rel=1e-6)
+
+
 LANES, PERIODS = 3, 42
 KNOWING = dataclasses.replace(
     KNOWLEDGE,

@@ -179,10 +179,12 @@ class Commanding:
         self.limited = np.full(observation.feature.shape[:-1], False)[()]
 
     def command(self, estimate, observation, reference):
-        state, u = self.law.command(self.state, estimate, observation, reference)
+        state, wanted = self.law.command(self.state, estimate, observation, reference)
+        u = wanted
         if self.finish:
             forward = reference[..., 1, :] - reference[..., 0, :] if self.aids.feedforward else np.zeros(())
-            u, self.limited = self.finish.finish(u, estimate.jacobian, observation.joint_position, forward)
+            u, self.limited = self.finish.finish(wanted, estimate.jacobian, observation.joint_position, forward)
+            u = self.law.restrained(state, wanted, u)
         self.state = self.law.noted(state, u, self.limited)
         return u
 

@@ -17,6 +17,7 @@ from servobench.plant.contract.settings import Count, NonNegative, Positive, Pos
 from servobench.plant.contract.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
+_MIN_ROOM: Final = 1e-12  # [rad/s] of a joint whose command is at the acceleration limit
 
 
 @settings
@@ -199,6 +200,14 @@ class MpcLaw(Law[MpcState]):
         fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
         final = error + ahead[..., -1, :]
         return MpcState(state.sent, state.last, fallbacks, J, targets, final, plan), velocity
+
+    def restrained(self, state: MpcState, wanted: FloatArray, joint_velocity: FloatArray) -> FloatArray:
+        """Return the velocity with as much of the stages' addition as the acceleration limit leaves room for."""
+        if self._shape.largest_change is None:
+            return joint_velocity
+        added, period = joint_velocity - wanted, self._spec.period
+        change = self._config.joint_acceleration_limit * period - np.sign(added) * (wanted - state.last / period)
+        return wanted + scale_to_limit(added, np.maximum(change, _MIN_ROOM))
 
     def noted(self, state: MpcState, joint_velocity: FloatArray, limited: BoolArray) -> MpcState:
         """Return the state with the step that is sent; see `Law.noted`."""
