@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
@@ -51,6 +51,17 @@ class Workspace:
     # all of the box is.
     clear: Clear | None = None
     ball: float | None = None  # radius of a ball of the user's [m]; None for that of the bench
+
+    def __post_init__(self) -> None:
+        """Check the shapes and freeze the arrays."""
+        n = len(self.home)
+        shapes = {"centre": 3, "shoulder": 3, **dict.fromkeys(("home", "lower", "upper", "stretched"), n)}
+        for name, size in shapes.items():
+            object.__setattr__(self, name, as_vector(name, getattr(self, name), size))
+        moves = {
+            name: (as_vector(name, start, n), as_vector(name, end, n)) for name, (start, end) in self.moves.items()
+        }
+        object.__setattr__(self, "moves", moves)
 
     @property
     def camera_distance(self) -> float:

@@ -56,6 +56,15 @@ def test_the_robot_without_a_name_is_the_ur5_of_the_bench():
     assert (robot.workspace.scale, robot.workspace.clear) == (1.0, None)
 
 
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_what_controllers_know_of_a_robot_is_read_only(name):
+    work = find_robot(name).workspace
+    kept = work.centre, work.shoulder, work.home, work.lower, work.upper, work.stretched, *work.moves["exp1"]
+    for array in map(np.asarray, kept):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
 @pytest.fixture(scope="module", params=["ur3e", "panda", "four.toml"])
 def robot(request, tmp_path_factory):
     if request.param in ROBOTS:
