@@ -30,7 +30,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le
 
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array, as_vector
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import (
     Check,
@@ -153,6 +153,8 @@ def _arm_of(table: DhTable) -> SerialArm:
 TURNING: Final = ("revolute", "continuous")
 COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 RPY: Final = re.compile(r"""\brpy\s*=\s*["']([^"']*)""")
+INERTIA_MARGIN: Final = 1e-6  # [1] of the largest moment, by which the others' sum is above it despite rounding
+ROUNDED_INERTIA: Final = 5e-3  # [1] of the largest moment, by which it exceeds the others' sum without a remark
 DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 
 
@@ -321,16 +323,37 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     own = [inertials[link.joint.child] for link in chain]
     efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]
     torque = np.array(efforts) if all(isfinite(effort) and effort > 0.0 for effort in efforts) else None
-    if any(inertial is None or not inertial.mass or inertial.inertia is None for inertial in own):
+    if any(inertial is None or not inertial.mass or not np.any(inertial.inertia) for inertial in own):
         further = "" if torque is not None else ", torque limits"
         return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}"
     mass = np.array([inertial.mass for inertial in own], dtype=np.float64)
     for link, each in zip(chain, mass.tolist(), strict=True):
         read_value(f"link {link.joint.child!r}: mass", each, MASS, lambda: "kg")
     poses = np.array([link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)])
-    R, inertia = poses[:, :3, :3], np.array([inertial.inertia for inertial in own], dtype=np.float64)
+    R = poses[:, :3, :3]
+    inertia = np.array([_balanced(link.joint.child, each.inertia) for link, each in zip(chain, own, strict=True)])
     links = estimate_links(arm, mass, torque, at_far_end(arm, poses[:, :3, 3], R @ inertia @ R.mT))
     return links, "" if torque is not None else "estimated: torque limits"
+
+
+def _balanced(link: str, given: FloatArray) -> FloatArray:
+    """Return the nearest inertia, (3, 3) kg m², whose largest principal moment is at most the sum of the others.
+
+    Published files exceed it, by rounding or by more: PyBullet then takes no inertia, and MuJoCo refuses the body.
+    """
+    inertia = as_array(f"link {link!r}: inertia", given, (3, 3))
+    moments, axes = np.linalg.eigh(inertia)
+    came = f"principal moments {', '.join(f'{moment:.3g}' for moment in moments)} kg m²"
+    if not moments[0] > 0.0:
+        raise ValueError(f"link {link!r}: inertia must be positive definite, got {came}; all zeros have it estimated")
+    excess = (1.0 + INERTIA_MARGIN) * moments[2] - moments[0] - moments[1]
+    if excess <= 0.0:
+        return inertia
+    moments = moments + excess / (3.0 + INERTIA_MARGIN) * np.array([1.0, 1.0, -1.0])
+    if excess > ROUNDED_INERTIA * moments[2]:
+        taken = ", ".join(f"{moment:.3g}" for moment in moments)
+        remark(f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}")
+    return np.asarray(axes * moments @ axes.T)
 
 
 def _pose(origin: FloatArray | None) -> FloatArray:

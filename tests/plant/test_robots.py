@@ -231,9 +231,24 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
             "limits that the URDF lacks are taken as ±2π rad and π rad/s: range of joint_1, range of",
         ),
         ('rpy="0.1', 'rpy="90', "has an rpy of 90, and angles of a URDF are in rad"),
+        (
+            'iyy="0.01"',
+            'iyy="0.04"',
+            "'link_1': no body has the principal moments 0.01, 0.01, 0.04 kg m², one above the",
+        ),
         ('<mass value="2', '<mass value="2000', "link 'link_1': mass is 2000, and usually at most 500 kg; if 2000g"),
     ]
     assert_remarks(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, cases)
+
+
+@pytest.mark.parametrize("yy", [0.02, 0.02001, 0.04])
+def test_a_body_of_a_urdf_has_the_nearest_possible_inertia(tmp_path, yy):
+    """Least squares: both small moments grow by a third of what they lack together, and the largest shrinks as much."""
+    pytest.importorskip("yourdfpy")
+    robot = robot_of(tmp_path, "arm.urdf", HEAVY.replace('iyy="0.01"', f'iyy="{yy}"'))
+    moments, third = np.linalg.eigvalsh(robot.links.inertia[0]), (yy - 0.02) / 3.0
+    np.testing.assert_allclose(moments, (0.01 + third, 0.01 + third, yy - third), rtol=2e-6)
+    assert moments[0] + moments[1] > moments[2]
 
 
 ODD = odd_urdf()
@@ -250,6 +265,10 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
         (
             HEAVY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="joint_1"/>'),
             r".*joint 'joint_2' on the way to '.*' turns with another \(mimic\)",
+        ),
+        (
+            HEAVY.replace('ixy="0"', 'ixy="0.02"'),
+            ": link 'link_1': inertia must be positive definite, got principal moments -0.01, 0.01, 0.03 kg m²; all",
         ),
         (HEAVY.replace('<mass value="2', '<mass value="-2'), ": link 'link_1': mass must be above 0, got -2.0"),
         (TWO_TREES, ".*both foot and link_4 are without a parent: a joint is missing or turned"),
