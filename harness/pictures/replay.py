@@ -129,7 +129,7 @@ class Replay(AbstractContextManager["Replay"]):
         self._run, self._fineness = run, fineness
         open_scene = scene_of(rendered_plant(str(run.track.row["plant"])))
         self._scene = open_scene(Room(run.model.arm, scenery=True, robot=run.robot))
-        self._camera = run.robot.pinhole
+        self._camera = run.robot.pinhole.reaching(run.robot.workspace.camera_distance)
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
         self._overview = Overview.of(run.robot.workspace.scale, fineness)

@@ -203,10 +203,11 @@ class Detector(ABC, Generic[Model]):
 class BallDetector(Detector[HandEyeModel]):
     """A fixed RGB-D camera; y = centre of the ball on the flange."""
 
-    def __init__(self, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
-        """Take a scene with a ball on the flange."""
+    def __init__(self, scene: Scene, config: RenderedConfig, robot: Robot) -> None:
+        """Take a scene with a ball on the flange of a robot."""
+        camera, ball_radius = CAMERA.reaching(robot.workspace.camera_distance), robot.workspace.ball_radius
         super().__init__(DepthCamera.streams)
-        self._scene, self._camera = scene, DepthCamera(scene, config, CAMERA, ball_radius)
+        self._scene, self._camera = scene, DepthCamera(scene, config, camera, ball_radius)
 
     def measure(self, model: HandEyeModel, q: FloatArray) -> tuple[FloatArray | None, None]:
         """Return the ball's centre as fitted to the depths, (3,) m, or None."""
@@ -223,11 +224,11 @@ class BallDetector(Detector[HandEyeModel]):
     def why_missing(self, model: HandEyeModel, q: FloatArray, valid: BoolArray | None) -> str:
         """Return where the ball is and would appear."""
         true, camera = model.to_camera(self._scene.ball_position()), self._camera.camera
+        clipped = camera.clipping([true[2] - self._camera.radius, true[2] + self._camera.radius])
         return (
             f"the ball is not visible at the start {q.round(6).tolist()}: it is at {true.round(3).tolist()} m in "
             f"the camera frame, column and row {camera.project(true).round(1).tolist()} of an image of "
-            f"{camera.width} x {camera.height}; it is hidden, out of sight, too small or cut "
-            "by the border"
+            f"{camera.width} x {camera.height}; it is {clipped}hidden, out of sight, too small or cut by the border"
         )
 
     def picture(self, model: HandEyeModel, q: FloatArray) -> ByteArray:
@@ -243,8 +244,8 @@ class MarkCameras:
 
     def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig) -> None:
         """Take a scene with the target of a set-up."""
-        self._scene, self._planned = scene, model.planned
-        self._lenses = [Lens(model.planned, model.optics, camera) for camera in range(model.setup.cameras)]
+        self._scene, self._planned = scene, model.planned.reaching(model.distance)
+        self._lenses = [Lens(self._planned, model.optics, camera) for camera in range(model.setup.cameras)]
         self._colours = MARK_COLOURS[: len(model.target)]
         self._centre = sphere_centre if len(model.target) == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
@@ -300,7 +301,7 @@ class BallCameras:
         points, planned = _some_points(model.setup), ideal_optics(model.planned, model.setup.cameras)
         if (model.setup.measure(points, model.optics) != model.setup.measure(points, planned)).any():
             raise ValueError(f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned")
-        self._camera = DepthCamera(scene, config, model.planned, ball_radius)
+        self._camera = DepthCamera(scene, config, model.planned.reaching(model.distance), ball_radius)
 
     def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
         """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
@@ -340,10 +341,11 @@ class SetupDetector(Detector[SetupModel]):
         valid = np.zeros(model.setup.m, dtype=np.bool_) if valid is None else valid
         names, true = np.array(model.setup.features)[~valid], model.feature(q)[~valid]
         wide, high = model.optics.size
+        clipped = model.planned.reaching(model.distance).clipping(model.point_motions(q)[0][..., 2])
         return (
             f"{', '.join(names)} cannot be seen at the start {q.round(6).tolist()}: without anything in between they "
             f"would be {true.round(1).tolist()} {model.setup.unit} in images of {wide:g} x {high:g}; the target is "
-            "hidden, out of sight, too small or cut by the border"
+            f"{clipped}hidden, out of sight, too small or cut by the border"
         )
 
     def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
@@ -358,7 +360,7 @@ def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot
         ValueError: cameras that cannot be rendered.
     """
     if isinstance(model, HandEyeModel):
-        return BallDetector(scene, config, robot.workspace.ball_radius)
+        return BallDetector(scene, config, robot)
     if not isinstance(model, SetupModel):
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
     if needs_depth(model.setup, model.optics):

@@ -123,7 +123,8 @@ class Overview:
         """
         width, height = (round(fineness * side) for side in (OVERVIEW_CAMERA.width, OVERVIEW_CAMERA.height))
         pose = _look_at(scale * np.array(OVERVIEW_POSITION), scale * np.array(OVERVIEW_TARGET))
-        return cls(replace(OVERVIEW_CAMERA, width=width, height=height), pose)
+        distance = scale * float(np.linalg.norm(np.subtract(OVERVIEW_POSITION, OVERVIEW_TARGET)))
+        return cls(replace(OVERVIEW_CAMERA.reaching(distance), width=width, height=height), pose)
 
     def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""

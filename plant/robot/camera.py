@@ -6,7 +6,8 @@ PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), n
 offset the error is 2.5 mm at 1.3 m.
 """
 
-from typing import Annotated, Final, TypeAlias
+from dataclasses import replace
+from typing import Annotated, Final, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,15 @@ class PinholeCamera:
         """Check the order of the clipping planes."""
         if not self.far > self.near:
             raise ValueError(f"far must be above near, {self.near:g} m, got {self.far:g} m")
+
+    def reaching(self, distance: float) -> Self:
+        """Return the camera with clipping planes that let a target at about this distance [m] be seen."""
+        return replace(self, near=min(self.near, distance / 5.0), far=max(self.far, 1.75 * distance))
+
+    def clipping(self, depths: npt.ArrayLike) -> str:
+        """Return words on the clipping planes for an error message; none where all depths [m] are between them."""
+        between = f"not between the clipping planes at {self.near:.3g} and {self.far:.3g} m, "
+        return between if np.less(depths, self.near).any() or np.greater(depths, self.far).any() else ""
 
     @property
     def focal(self) -> float:

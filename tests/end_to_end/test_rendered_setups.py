@@ -1,11 +1,14 @@
 """Sensing set-ups in rendered images, against the closed form of `kinematic`."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from kit.own import write
 from kit.rendered import IDEAL
+from kit.robots import FOUR_JOINTS
 from servobench.harness.config.registry import find_plant, scene_of
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import Sensing
@@ -82,6 +85,22 @@ def test_another_arm_carries_the_plate_at_its_own_scale(open_setup):
     panda, model = find_robot("panda"), true_model("plate", find_robot("panda"))
     plant = open_setup(model, rendered_config(panda), panda.workspace.home, panda)
     assert plant.reset(0).feature_valid
+
+
+@pytest.mark.parametrize(
+    ("scale", "word"), [(0.08, "pixel:hand"), (0.08, "position"), (5.0, "pixel"), (5.0, "position")]
+)
+def test_cameras_of_small_and_large_arms_see_the_target(tmp_path, open_setup, scale, word):
+    lengths = {length: f"{scale * float(length):g}" for length in ("0.45", "0.4", "0.1", "0.35")}
+    text = re.sub(r"\b0\.\d+\b", lambda found: lengths.get(found[0], found[0]), FOUR_JOINTS)
+    robot = find_robot(str(write(tmp_path, text, "arm.toml")))
+    model = Sensing.parse(word).nominal(robot)
+    plant = open_setup(model, replace(IDEAL, drives=rendered_config(robot).drives), robot.workspace.home, robot)
+    observation = plant.reset(0)
+    assert observation.feature_valid
+    np.testing.assert_allclose(
+        observation.feature, plant.truth().feature, atol=0.005 * scale if word == "position" else 1.0
+    )
 
 
 def test_a_hidden_disc_is_lost_alone_and_held(open_setup):

@@ -12,6 +12,15 @@ def points(count: int) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(0.4, 2.0, count)])
 
 
+def test_the_clipping_planes_are_those_of_the_bench_unless_a_target_is_nearer_or_farther():
+    assert CAMERA.reaching(1.3) == CAMERA.reaching(0.5) == CAMERA  # a UR5's cameras beside the arm and on its hand
+    assert (CAMERA.reaching(0.05).near, CAMERA.reaching(4.6).far) == pytest.approx((0.01, 8.05))
+    assert (CAMERA.clipping([0.2, 3.9]), CAMERA.clipping([0.2, 4.1])) == (
+        "",
+        "not between the clipping planes at 0.1 and 4 m, ",
+    )
+
+
 def test_a_ray_times_its_depth_is_the_point_that_was_projected():
     p = points(50)
     columns, rows = CAMERA.project(p).T
