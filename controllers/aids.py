@@ -72,7 +72,7 @@ class AidsConfig:
     response_length: Annotated[Positive, Le(2.0)] = 0.6
     """[s] within which joints respond to a command; for an identified response."""
     feature_noise: Deviation = 0.001
-    """[unit of the feature] standard deviation of a feature; the first guess where it is identified."""
+    """[m] standard deviation of a feature, of pixels too; the first guess where it is identified."""
     delay_margin: NonNegative = 6.0
     """[1] by which a delay must be better than the present one, in −2 log likelihood."""
     score_memory: Share = 1.0

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.request import RunSettings
 from servobench.plant.contract.sensing import SensingConfig
@@ -15,7 +16,12 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.mismatch import Mismatch
 
-DEFAULTS = {"bullet": RenderedConfig(), "kinematic": KinematicConfig(), "run": RunSettings()}
+DEFAULTS = {
+    "bullet": RenderedConfig(),
+    "kinematic": KinematicConfig(),
+    "run": RunSettings(),
+    "ukf_mfac": METHODS["ukf_mfac"].config(),
+}
 
 
 def read(assignment):
@@ -60,6 +66,7 @@ def test_settings_take_units():
         ("kinematic.sensing.drop_probability=120%", "drop_probability must be below 100%, got 120%"),
         ("kinematic.sensing.feature_noise=-2px", "feature_noise must be at least 0"),
         ("kinematic.sensing.feature_noise=2kg", "feature_noise must be a number in m, cm, mm, px, got '2kg'"),
+        ("ukf_mfac.aids.feature_noise=2px", "aids.feature_noise must be a number in m, cm, mm, got '2px'"),
     ],
 )
 def test_a_refusal_is_in_the_unit_that_was_written(assignment, message):
