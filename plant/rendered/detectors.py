@@ -83,7 +83,7 @@ class Lens:
             return
         rays = _rays(planned, own)
         half = np.abs(rays[:, :2]).max(axis=0) * own.focal[0] + 2.0
-        largest = max(MAX_SIZE, 2 * planned.width)
+        largest = max(MAX_SIZE, 2 * planned.width, 2 * planned.height)
         width, height = (min(largest, 2 * math.ceil(size)) for size in half.tolist())
         fov = 2.0 * math.degrees(math.atan(0.5 * height / own.focal[0]))
         self._ideal = replace(planned, width=width, height=height, vertical_fov=fov)

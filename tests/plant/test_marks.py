@@ -1,5 +1,7 @@
 """Coloured marks in drawn images, and the lens, without an engine."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,11 @@ from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
-from servobench.plant.robot.camera import CAMERA
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 
 COLUMNS, ROWS = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
 RAYS = CAMERA.rays(COLUMNS.ravel(), ROWS.ravel()).reshape(CAMERA.height, CAMERA.width, 3)
+TALL = PinholeCamera(240, 1280, 60.0)
 BENT = Optics(np.array([190.0]), np.array([[167.3, 112.6]]), np.array([-0.08]), (320.0, 240.0))
 
 
@@ -148,13 +151,19 @@ class Wall(Scene):
     ball_position = close = place
 
 
-@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.3, -0.2, 0.6), (-0.28, 0.17, 0.5)])
-def test_a_lens_shows_a_point_where_its_optics_project_it(centre):
-    image = Lens(CAMERA, BENT, 0).render(Wall(centre, 0.03), np.eye(4))
-    assert image.shape == (CAMERA.height, CAMERA.width, 3)
+@pytest.mark.parametrize(
+    ("camera", "optics", "centre"),
+    [
+        *((CAMERA, BENT, centre) for centre in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.6), (-0.28, 0.17, 0.5))),
+        (TALL, replace(ideal_optics(TALL, 1), distortion=np.array([0.001])), (0.0, -0.23, 0.5)),
+    ],
+)
+def test_a_lens_shows_a_point_where_its_optics_project_it(camera, optics, centre):
+    image = Lens(camera, optics, 0).render(Wall(centre, 0.03), np.eye(4))
+    assert image.shape == (camera.height, camera.width, 3)
     (mark,) = find_marks(image, MARK_COLOURS[1:2])
-    true = project(np.array(centre)[None, None], BENT)[0, 0]
-    assert np.linalg.norm(disc_centre(mark, CAMERA) - true) < 0.2
+    true = project(np.array(centre)[None, None], optics)[0, 0]
+    assert np.linalg.norm(disc_centre(mark, camera) - true) < 0.2
 
 
 def test_a_camera_as_planned_needs_no_lens():
