@@ -309,6 +309,9 @@ def test_settings_that_do_not_fit_the_plant_are_named():
         MpcLaw(replace(config, delay=0.15), RobotKnowledge(make_spec(), 10))
     with pytest.raises(ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"):
         MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
+    with pytest.raises(ValueError, match=r"forgetting must be at most 400 1/s for blocks of 0.05 s.*; got 1e\+06 1/s"):
+        MpcLaw(replace(config, forgetting=1e6), RobotKnowledge(make_spec(), 10))
+    assert np.isfinite(make_law(make_spec(), forgetting=400.0).law._integrals).all()
     with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
         MpcLaw(replace(config, joint_weight=(1.0, 2.0)), RobotKnowledge(make_spec(), 10))
 

@@ -17,6 +17,7 @@ from servobench.plant.contract.settings import Count, NonNegative, Positive, Pos
 from servobench.plant.contract.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
+_MAX_FORGETTING: Final = 20.0  # [1] a block, after which an error weighs 2e-9 of the present one
 _MIN_ROOM: Final = 1e-12  # [rad/s] of a joint whose command is at the acceleration limit
 
 
@@ -128,6 +129,9 @@ class MpcLaw(Law[MpcState]):
             check_preview(reach, knowledge.preview, spec.period, "horizon_time + delay")
         if config.view_tangent and spec.m != 3:
             raise ValueError(f"view_tangent needs the 3 features x, y, z, got {spec.m} features")
+        if config.forgetting * blocks.length > _MAX_FORGETTING:
+            most = f"at most {_MAX_FORGETTING / blocks.length:g} 1/s for blocks of {blocks.length:g} s"
+            raise ValueError(f"forgetting must be {most}, or no error ahead counts; got {config.forgetting:g} 1/s")
         self._config, self._spec, self._blocks = config, spec, blocks
         own: dict[Stage, bool] = {"limit": True, "preview": config.use_preview, "predict": config.delay > 0.0}
         self.owns = frozenset(stage for stage, brought in own.items() if brought)
