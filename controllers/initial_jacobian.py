@@ -8,18 +8,21 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 """
 
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, Generic, Literal, NamedTuple, TypeVar, final
+from math import ceil
+from typing import Annotated, Any, Final, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.lanes import branch, pick, transposed
-from servobench.plant.contract.settings import Count, Number, Periods, Positive, Usual, settings
+from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
+MIN_FEATURES: Final = 3  # that end a rest after its time where frames are lost or slow
 State = TypeVar("State")
 IntArray = npt.NDArray[np.int_]
 
@@ -32,12 +35,12 @@ class InitialConfig:
     """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
     probe_step: Annotated[Positive, Usual(0.3)] = 0.03
     """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
-    probe_periods: Count = 2
-    """[periods] over which a probing move is spread."""
-    settle_periods: Periods = 7
-    """[periods] of rest before a feature counts."""
-    average_periods: Count = 3
-    """[periods] valid features that are averaged at each rest."""
+    probe_time: Annotated[Positive, Usual(2.0)] = 0.1
+    """[s] over which a probing move is spread."""
+    settle_time: Delay = 0.35
+    """[s] of rest before a feature counts."""
+    average_time: Annotated[Positive, Usual(2.0)] = 0.15
+    """[s] of valid features that are averaged at each rest."""
     given: tuple[tuple[Number, ...], ...] = ()
     """[m/rad] m rows of n entries; only for source "given"."""
 
@@ -97,8 +100,8 @@ class ProbeState(NamedTuple):
     rest_positions: FloatArray  # (..., n+1, n) [rad], mean joint positions of the rests
     rest_features: FloatArray  # (..., n+1, m), mean features of the rests
     gathered: IntArray  # (...), observations gathered at the present rest
-    positions: FloatArray  # (..., a, n) [rad], their joint positions
-    features: FloatArray  # (..., a, m), their features
+    positions: FloatArray  # (..., n) [rad], sum of their joint positions
+    features: FloatArray  # (..., m), sum of their features
     phase: IntArray  # (...) [periods] since the present move began
     rest_begins: IntArray  # (...) [periods] duration of the present move
 
@@ -107,8 +110,8 @@ class ProbeState(NamedTuple):
 class ProbedJacobian(InitialJacobian[ProbeState]):
     """Ĵ₀ = ΔY ΔQ⁺ from one small move of each joint, rest to rest.
 
-    Encoder readings are used for ΔQ, so a joint that falls short of its command does no harm. Lost frames prolong a
-    rest: it ends with the wanted number of valid features.
+    Encoder readings are used for ΔQ, so a joint that falls short of its command does no harm. Times are rounded up to
+    control periods. A rest ends with a valid feature for each period of its time, or after it with `MIN_FEATURES`.
     """
 
     def __init__(self, config: InitialConfig, spec: PlantSpec) -> None:
@@ -119,14 +122,15 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         """
         self._config = config
         self._spec = spec
-        rest = config.average_periods
-        self.duration = rest + spec.n * (config.probe_periods + config.settle_periods + rest - 1)
-        self._speed = config.probe_step / (config.probe_periods * spec.period)
+        times = config.probe_time, config.settle_time, config.average_time
+        self._move, self._settle, self._rest = (ceil(in_periods(time, spec.period)) for time in times)
+        self.duration = self._rest + spec.n * (self._move + self._settle + self._rest - 1)
+        self._speed = config.probe_step / (self._move * spec.period)
         slowest = float(spec.joint_velocity_limit.min())
         if self._speed > slowest:
-            largest = slowest * config.probe_periods * spec.period
+            largest = slowest * self._move * spec.period
             raise ValueError(
-                f"probe_step must be at most {largest:.6g} rad for probe_periods = {config.probe_periods}, or a joint "
+                f"probe_step must be at most {largest:.6g} rad for probe_time = {config.probe_time:g} s, or a joint "
                 f"exceeds its limit of {slowest:g} rad/s; got {config.probe_step:g} rad"
             )
         narrowest = float((spec.joint_upper - spec.joint_lower).min())
@@ -136,24 +140,25 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
 
     def start(self, observation: Observation) -> ProbeState:
         """Return the state at the first rest, which is the start of the run."""
-        lead, (m, n), count = observation.feature.shape[:-1], (self._spec.m, self._spec.n), self._config.average_periods
+        lead, (m, n) = observation.feature.shape[:-1], (self._spec.m, self._spec.n)
         return ProbeState(
             rests=np.zeros(lead, dtype=np.int_),
             rest_positions=np.zeros((*lead, n + 1, n)),
             rest_features=np.zeros((*lead, n + 1, m)),
             gathered=np.zeros(lead, dtype=np.int_),
-            positions=np.zeros((*lead, count, n)),
-            features=np.zeros((*lead, count, m)),
-            phase=np.full(lead, self._config.settle_periods),  # the arm starts at rest
+            positions=np.zeros((*lead, n)),
+            features=np.zeros((*lead, m)),
+            phase=np.full(lead, self._settle),  # the arm starts at rest
             rest_begins=np.zeros(lead, dtype=np.int_),
         )
 
     def step(self, state: ProbeState, observation: Observation) -> tuple[ProbeState, FloatArray, BoolArray]:
         """Return the velocity of the probing move, zero while resting or done, and whether all joints have moved."""
         config, n = self._config, self._spec.n
-        settled = (state.phase >= state.rest_begins + config.settle_periods) & observation.feature_valid
-        state = branch(settled, self._gather, state, observation)
-        state = branch(state.gathered == config.average_periods, self._end_rest, state)
+        rested = state.phase - state.rest_begins - self._settle
+        state = branch((rested >= 0) & observation.feature_valid, self._gather, state, observation)
+        enough = np.where(rested + 1 < self._rest, self._rest, min(self._rest, MIN_FEATURES))
+        state = branch(state.gathered >= enough, self._end_rest, state)
         done = state.rests == n + 1
         joint = np.minimum(state.rests, n) - 1
         moves = (state.phase < state.rest_begins) & ~done
@@ -165,20 +170,22 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
 
     def _gather(self, state: ProbeState, observation: Observation) -> ProbeState:
         return state._replace(
-            positions=_with_entry(state.positions, state.gathered, observation.joint_position),
-            features=_with_entry(state.features, state.gathered, observation.feature),
+            positions=state.positions + observation.joint_position,
+            features=state.features + observation.feature,
             gathered=state.gathered + 1,
         )
 
     def _end_rest(self, state: ProbeState) -> ProbeState:
-        zero = np.zeros_like(state.phase)
+        zero, count = np.zeros_like(state.phase), np.asarray(state.gathered)[..., None]
         return state._replace(
-            rest_positions=_with_entry(state.rest_positions, state.rests, state.positions.mean(axis=-2)),
-            rest_features=_with_entry(state.rest_features, state.rests, state.features.mean(axis=-2)),
+            rest_positions=_with_entry(state.rest_positions, state.rests, state.positions / count),
+            rest_features=_with_entry(state.rest_features, state.rests, state.features / count),
             rests=state.rests + 1,
             gathered=zero,
+            positions=np.zeros_like(state.positions),
+            features=np.zeros_like(state.features),
             phase=zero,
-            rest_begins=zero + self._config.probe_periods,
+            rest_begins=zero + self._move,
         )
 
     def jacobian(self, state: ProbeState) -> FloatArray:

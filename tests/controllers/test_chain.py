@@ -142,7 +142,7 @@ def others():
             "law": dataclasses.replace(config.law, **ofl),
             "estimator": dataclasses.replace(config.estimator, **ofe),
         }
-        initial = InitialConfig("probe", probe_step=0.01, settle_periods=1, average_periods=1)
+        initial = InitialConfig("probe", probe_step=0.01, settle_time=0.05, average_time=0.05)
         config = dataclasses.replace(config, **parts, aids=AidsConfig(**(aids | own)), initial=initial)
         yield pytest.param(entry, config, id=f"{law}+{estimator}")
 

@@ -94,7 +94,7 @@ def test_a_method_keeps_the_contract_of_controllers(entry):
 
 @pytest.mark.parametrize("entry", COMPOSED)
 def test_reset_forgets_everything_also_while_the_jacobian_is_probed(entry):
-    initial = InitialConfig(source="probe", probe_step=1e-3, settle_periods=1, average_periods=1)
+    initial = InitialConfig(source="probe", probe_step=1e-3, settle_time=0.05, average_time=0.05)
     knowledge, config = robot(5, 3, 7), dataclasses.replace(default_config(entry), initial=initial)
     controller = entry.build(config, knowledge)
     first = random_run(controller, knowledge.spec, 1, 0.5, 40)

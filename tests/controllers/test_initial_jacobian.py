@@ -22,8 +22,8 @@ def spec(reach=1.0):
     return plant_spec(2, 1, reach=reach)
 
 
-def kinematic(**settings):
-    return build_kinematic(configure(KinematicConfig, **settings), PlantSetup(nominal_ur5(), START, 0.05))
+def kinematic(period=0.05, **settings):
+    return build_kinematic(configure(KinematicConfig, **settings), PlantSetup(nominal_ur5(), START, period))
 
 
 def probe(plant, seed=0, **settings):
@@ -41,8 +41,10 @@ def probe(plant, seed=0, **settings):
         periods += 1
 
 
-def test_probing_finds_the_true_jacobian_through_lag_delay_and_latency():
-    J, _ = probe(kinematic(feature_noise=0.0, latency=0.05), probe_step=0.002)
+@pytest.mark.parametrize("period", [0.1, 0.05, 0.02, 0.01])
+def test_probing_finds_the_true_jacobian_through_lag_delay_and_latency_at_any_rate(period):
+    J, periods = probe(kinematic(period, feature_noise=0.0, latency=0.05), probe_step=0.002)
+    assert periods * period == pytest.approx(3.35, abs=0.4)  # times are whole periods
     np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
 
 
@@ -56,8 +58,8 @@ def test_probing_through_default_noise_is_as_good_as_the_averaged_noise_allows()
 def test_probing_takes_the_periods_that_its_settings_tell():
     plant, config = kinematic(), InitialConfig(source="probe")
     _, periods = probe(plant)
-    each = config.probe_periods + config.settle_periods + config.average_periods
-    assert periods == config.average_periods - 1 + 6 * each - 6
+    each = config.probe_time + config.settle_time + config.average_time
+    assert periods == round((config.average_time + 6 * each) / 0.05) - 1 - 6
     assert initial_jacobian(config, RobotKnowledge(plant.spec, 0)).duration == periods + 1
 
 
@@ -65,6 +67,11 @@ def test_lost_frames_prolong_probing_and_do_no_harm():
     J, periods = probe(kinematic(feature_noise=0.0, drop_probability=0.4), probe_step=0.002)
     assert periods > probe(kinematic())[1]
     np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
+
+
+def test_frames_slower_than_the_control_prolong_a_rest_until_there_are_three():
+    assert probe(kinematic(0.01, frame_period=0.05))[1] * 0.01 == pytest.approx(7 * 0.15 + 6 * 0.45, abs=0.4)
+    assert probe(kinematic(0.01, frame_period=0.2))[1] * 0.01 == pytest.approx(7 * 0.6 + 6 * 0.4, abs=0.6)
 
 
 def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_model_returns():
@@ -78,7 +85,7 @@ def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_mo
 
 
 def test_a_probing_move_turns_away_from_a_joint_limit():
-    provider = initial_jacobian(InitialConfig("probe", average_periods=1), RobotKnowledge(spec(), 0))
+    provider = initial_jacobian(InitialConfig("probe", average_time=0.05), RobotKnowledge(spec(), 0))
     at = Observation(0.0, np.array([0.99, 0.0]), np.zeros(1))
     _, u, _ = provider.step(provider.start(at), at)
     np.testing.assert_allclose(u, [-0.3, 0.0])

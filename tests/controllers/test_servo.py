@@ -160,7 +160,7 @@ def test_a_law_of_the_model_works_in_the_frame_of_the_model():
 
 
 def test_the_stages_start_where_the_probing_ends():
-    probing = {"source": "probe", "probe_step": 0.01, "settle_periods": 1, "average_periods": 1}
+    probing = {"source": "probe", "probe_step": 0.01, "settle_time": 0.05, "average_time": 0.05}
     knowledge = dataclasses.replace(KNOWLEDGE, preview=1)
     controller, q, reference = (
         servo(ConstantEstimator(), None, EQUIPPED, knowledge, **probing),

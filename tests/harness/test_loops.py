@@ -185,7 +185,7 @@ def test_a_law_that_was_trained_on_the_nominal_model_has_a_delay_margin():
 
 
 def test_a_controller_is_warm_after_its_probing_however_long_that_takes():
-    warm = warm_up(resolved("ukf_mfac", initial={"source": "probe", "average_periods": 20}))
+    warm = warm_up(resolved("ukf_mfac", initial={"source": "probe", "average_time": 1.0}))
     assert warm.controller.state.ready
     linear_controller(warm, "true")
 
