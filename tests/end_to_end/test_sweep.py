@@ -109,6 +109,15 @@ def test_folders_that_are_no_parts_of_one_batch_are_not_merged(refusal_of, undis
     assert not (tmp_path / "merged").exists()
 
 
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_period_that_is_set_is_a_column_of_every_run(monkeypatch, tmp_path, workers):
+    words = "--seeds", "2", "--set", "run.period=0.1", "--workers", workers, "--out", str(tmp_path / "out")
+    assert servobench(monkeypatch, *SWEEP[:7], *words) == 0
+    runs = pd.read_parquet(tmp_path / "out" / results.RUNS)
+    assert set(runs["status"]) == {"completed"}
+    assert set(runs["period_s"]) == {0.1}
+
+
 @pytest.mark.parametrize("part", ["0/3", "4/3", "3", "a/b", "1/49"])
 def test_a_part_that_there_is_not_is_refused(refusal_of, part, tmp_path):
     assert "part" in refusal_of(*SWEEP, "--part", part, "--out", tmp_path / "out")
