@@ -27,8 +27,9 @@ import servobench
 from measuring import options
 from servobench.harness.config.description import toml
 from servobench.harness.config.settings import Settings, flatten, nest
+from servobench.harness.run.drive import command_response
 from servobench.harness.run.experiment import build, draw_robot
-from servobench.harness.run.identification import command_response, read_log
+from servobench.harness.run.identification import read_log
 from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import SHORT_NAMES, RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.resolution import resolve

@@ -167,8 +167,9 @@ def identify(
     A mistake of the log, such as exchanged joints, is named instead, with exit code 1.
     """
     from servobench.harness.batch.logs import UnevenRows
+    from servobench.harness.run.drive import command_response
     from servobench.harness.run.experiment import build
-    from servobench.harness.run.identification import command_response, read_log
+    from servobench.harness.run.identification import read_log
     from servobench.harness.run.preflight import mistakes
     from servobench.harness.run.request import find_sensing
     from servobench.harness.run.twin_file import estimates, remarks, twin_text

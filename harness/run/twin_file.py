@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.description import toml
-from servobench.harness.run.identification import EXTRAS, OUTLIER, Identified, Log, Response, kind_of, prior
+from servobench.harness.run.drive import Response
+from servobench.harness.run.identification import EXTRAS, OUTLIER, Identified, Log, kind_of, prior
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import TIMES

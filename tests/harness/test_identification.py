@@ -11,14 +11,13 @@ from scipy.stats import chi2
 
 from kit.own import write
 from servobench import run
+from servobench.harness.run.drive import command_response, joint_steps
 from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.identification import (
     _Problem,
-    command_response,
     correlation_time,
     fit_cameras,
     identify,
-    joint_steps,
     read_log,
     robust_covariance,
 )
