@@ -28,7 +28,7 @@ class Excite(servobench.Controller):
 
     def __init__(self, config: ExciteConfig, knowledge):
         self.config, self.period, self.n = config, knowledge.spec.period, knowledge.spec.n
-        self.jacobian = knowledge.nominal_jacobian
+        self.jacobian, self.limit = knowledge.nominal_jacobian, knowledge.spec.joint_velocity_limit
 
     def reset(self, observation, seed):
         config, draws = self.config, np.random.default_rng(seed)
@@ -48,4 +48,4 @@ class Excite(servobench.Controller):
 
     def step(self, observation, reference):
         now, then = self.position(observation.time), self.position(observation.time + self.period)
-        return servobench.Command((then - now) / self.period)
+        return servobench.Command(np.clip((then - now) / self.period, -self.limit, self.limit))  # logged as it is sent

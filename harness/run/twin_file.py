@@ -67,6 +67,8 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
     elif response.unexplained > MAX_UNEXPLAINED:
         left = f"{response.unexplained:.0%} of the joint motion"
         lines.append(f"delay and lag leave {left}: the drive is no first-order lag")
+    if response is not None and response.level < math.inf:
+        lines.append(f"commands act as if clipped at {response.level:.3g} rad/s: log them as they are sent")
     for section, settings in sensor(log, robot).settings.items():
         words = ", ".join(f"{section}.{name}={value:.3g}" for name, value in settings.items())
         lines.append(f"settings of a plant: {words}")

@@ -108,6 +108,23 @@ def test_delay_and_lag_are_those_of_the_drive():
     assert command_response(log._replace(commands=None)) is None
 
 
+def driven(commands, period=0.05):
+    """Return joint positions (k, n) of a drive with these commands."""
+    return np.concatenate([np.zeros((1, 6)), joint_steps(commands, period, DELAY, LAG)]).cumsum(axis=0)
+
+
+@pytest.mark.parametrize(("gain", "clipped", "level"), [(1.0, 0.1, 0.1), (10.0, 1.5, 1.5), (10.0, np.inf, np.inf)])
+def test_delay_and_lag_are_found_although_commands_are_clipped_elsewhere(gain, clipped, level):
+    """The spec of a table has the limit of 1 rad/s, whatever that of the robot is."""
+    log = logged()[0]
+    u = gain * log.commands
+    response = command_response(log._replace(commands=u, joints=driven(np.clip(u, -clipped, clipped))))
+    assert response[:2] == pytest.approx((DELAY, LAG), abs=1e-3)
+    assert response.level == pytest.approx(level, rel=1e-3)
+    lines = "\n".join(remarks(log, identified(), response))
+    assert ("commands act as if clipped at " in lines) is (level < np.inf)
+
+
 def test_a_drive_that_is_no_first_order_lag_widens_the_interval_of_the_delay():
     """Joints that stick at slow speed move in steps, which no lag has."""
     log = logged()[0]
