@@ -5,6 +5,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 
 from servobench.harness.config.description import toml
 from servobench.harness.run.drive import Response
@@ -24,6 +25,10 @@ MAX_SPREAD: Final = 0.05  # [s] of these times that is no outlier
 SLOW_SHARE: Final = 0.3  # [1] of the frames, in which their lateness hardly shows
 LATE_RATIO: Final = 0.2  # [1] median over mean of squared errors, above which fast frames are late and not false
 BURST_RATIO: Final = 2.0  # [1] lost frames in a row over those of independent losses
+MIN_ODD: Final = 0.05  # [1] of the usual gaps between frames, from which others belong to the camera's period
+ODD_GAPS: Final = 12.0  # of a steady camera, within which the lateness of its frames changes by less than UNEVEN
+MIN_PART: Final = 1e-3  # [rows] from which the distance of frames is no whole number of rows
+UNEVEN: Final = 2.0  # [rows]
 JITTERS: Final = np.arange(0.01, 0.5, 0.01).tolist()  # [s]
 UNITS: Final = {  # of parameters as they are printed, by the begin of their names, and how many are one of their own
     "latency": ("ms", 1e3), "camera_turn": ("°", 180.0 / math.pi), "camera": ("mm", 1e3), "tool": ("mm", 1e3),
@@ -101,14 +106,31 @@ def unexplained(log: Log, robot: Identified) -> tuple[float, float]:
 
 
 def frame_period(log: Log) -> float:
-    """Return the distance of frames of which some may be missing [s]."""
-    return log.spec.period * float(np.gcd.reduce(np.diff(np.flatnonzero(log.valid))))
+    """Return the distance of frames of which some may be missing [s]: usual gaps, and those a row longer or shorter."""
+    rows = np.flatnonzero(log.valid)
+    gaps = np.diff(rows)
+    counts = np.bincount(gaps, minlength=gaps.max() + 2)
+    usual = int(counts.argmax())
+    other = max(usual - 1, usual + 1, key=lambda gap: int(counts[gap]))
+    length = float(np.average([usual, other], weights=counts[[usual, other]]))
+    if usual == 1 < length:  # a gap of two rows is a lost frame, or one of a steady camera
+        frames = np.cumsum(np.where(gaps <= other, 1.0, np.rint(gaps / length)))
+        window = min(len(gaps), int(ODD_GAPS / (length - 1.0)))
+        late = sliding_window_view(rows[1:] - length * frames, window)[::window]
+        length = length if np.median(np.ptp(late, axis=1)) < UNEVEN else 1.0
+    return log.spec.period * (usual if counts[other] < MIN_ODD * counts[usual] else length)
+
+
+def missing_frames(log: Log) -> FloatArray:
+    """Return how many frames are missing in each gap between two."""
+    gaps, length = np.diff(np.flatnonzero(log.valid)), frame_period(log) / log.spec.period
+    return np.asarray(np.where(gaps > math.ceil(length - 1e-9), np.rint(gaps / length) - 1.0, 0.0))
 
 
 def lost_share(log: Log) -> float:
     """Return the share of the frames that did not arrive."""
-    rows = np.flatnonzero(log.valid)
-    return max(0.0, 1.0 - (len(rows) - 1) * frame_period(log) / float(log.time[rows[-1]] - log.time[rows[0]]))
+    missing = missing_frames(log)
+    return float(missing.sum() / (missing.sum() + len(missing)))
 
 
 def untold_combinations(robot: Identified) -> list[str]:
@@ -159,9 +181,13 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     elif gap * (1.0 - lost) > BURST_RATIO:
         sensing |= {"occlusions": lost, "occlusion_duration": gap * frame_period(log)}
         lost = 0.0
+    rows = frame_period(log) / log.spec.period
+    wait = waiting.mean or 0.5 * log.spec.period * (
+        abs(rows - round(rows)) > MIN_PART
+    )  # until the next control instant
     if waiting.mean:
         noise, outliers, lost = steady, ~kept, max(0.0, lost - waiting.missing)
-    latency = max(0.0, robot.estimate("latency")[0] - waiting.mean)  # an estimate of 0 may fall below it
+    latency = max(0.0, robot.estimate("latency")[0] - wait)  # an estimate of 0 may fall below it
     sections: dict[str, dict[str, float]] = {"sensing": sensing, "mechanics": mechanics}
     return Sensor(latency, noise, outliers, lost, {name: own for name, own in sections.items() if own})
 
@@ -208,8 +234,8 @@ def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: flo
 
 def usual_gap(log: Log) -> float:
     """Return how many frames are missing in a row where any is."""
-    missing = np.diff(np.flatnonzero(log.valid)) * log.spec.period / frame_period(log) - 1.0
-    return float(np.median(missing[missing > 0.5])) if (missing > 0.5).any() else 0.0
+    missing = missing_frames(log)
+    return float(np.median(missing[missing > 0.0])) if missing.any() else 0.0
 
 
 def twin_text(robot: Identified, log: Log, response: Response | None, named: tuple[str, str]) -> str:

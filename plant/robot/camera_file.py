@@ -162,25 +162,31 @@ class OwnCamera:
     def sensing(self, usual: SensingConfig, period: float) -> SensingConfig:
         """Return the settings of a sensor with this camera's timing and noise.
 
-        A frame takes a multiple of the control `period` [s], or else whole milliseconds; where two or more are
-        delivered in each period, one arrives at every control instant.
-
         Raises:
             ValueError: a noise that cannot be read.
         """
         keys, changes = self.keys, dict[str, Any]()
         if keys.rate is not None:
-            frames, whole = keys.rate * period, max(1, round(1e3 / keys.rate)) / 1e3
-            if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
-                whole = 0.0
-            elif abs(round(1.0 / frames) * frames - 1.0) < 1e-5:
-                whole = round(1.0 / frames) * period
-            elif abs(round(whole / period) * period - whole) > ROUNDED * period:
-                clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
-                remark(f"camera {self.name}: {clocks}, so delays change; --set run.period={1e3 * whole:g}ms helps")
-            changes["frame_period"] = whole
+            changes["frame_period"] = frame_time(f"camera {self.name}", keys.rate, period)
         changes |= {} if keys.latency is None else {"latency": keys.latency}
         return override(str(self.files[0]), usual, changes | ({"feature_noise": keys.noise} if keys.noise else {}))
+
+
+def frame_time(what: str, rate: float, period: float) -> float:
+    """Return how long a frame of a camera with a rate [Hz] takes on the bench [s].
+
+    It is a multiple of the control `period` [s], or else whole milliseconds; where two or more are delivered in each
+    period, one arrives at every control instant: 0.
+    """
+    frames, whole = rate * period, max(1, round(1e3 / rate)) / 1e3
+    if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
+        return 0.0
+    if abs(max(1, round(1.0 / frames)) * frames - 1.0) < 1e-5:
+        return round(1.0 / frames) * period
+    if abs(round(whole / period) * period - whole) > ROUNDED * period:
+        clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
+        remark(f"{what}: {clocks}, so delays change; --set run.period={1e3 * whole:g}ms helps")
+    return whole
 
 
 def read_camera(path: Path, *, second: bool = False) -> OwnCamera:

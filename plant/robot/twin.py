@@ -34,7 +34,7 @@ from servobench.plant.contract.settings import (
     settings,
 )
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.robot.camera_file import CameraFile
+from servobench.plant.robot.camera_file import ROUNDED, CameraFile, frame_time
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 
 TIMES: Final = ("latency", "command_delay", "lag")
@@ -179,8 +179,8 @@ class Twin:
             sensing |= {"feature_noise": f"{scale}{unit}" if unit else scale, "noise_shape": shape.tolist()}
         if keys.outliers > 0.0:
             sensing["outlier_size"] = f"{keys.outlier_size}{unit}" if unit else keys.outlier_size
-        if keys.camera.rate is not None and (rows := round(1.0 / (keys.camera.rate * period))) > 1:
-            sensing["frame_period"] = rows * period  # else frames of any age arrive at control instants
+        if (rate := keys.camera.rate) is not None and abs(rate * period - 1.0) > ROUNDED:
+            sensing["frame_period"] = frame_time(f"twin {self.path}", rate, period)
         known = {each.name for each in fields(config)}
         given = {**times, **keys.plant, "sensing": sensing | keys.plant.get("sensing", {})}
         return {name: value for name, value in given.items() if name in known}

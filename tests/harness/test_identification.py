@@ -23,8 +23,9 @@ from servobench.harness.run.identification import (
 )
 from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
-from servobench.harness.run.twin_file import estimates, remarks, sensor, twin_text
+from servobench.harness.run.twin_file import estimates, frame_period, lost_share, remarks, sensor, twin_text
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
@@ -333,6 +334,33 @@ def test_a_twin_has_the_gears_the_tool_and_the_lateness_that_a_log_tells(world, 
     path = write(tmp_path, twin_text(robot, log, command_response(log), ("ur5", "position")), "twin.toml")
     row = run("constant", robot=str(path), mismatch="none", settings={"exp1": {"duration": 1.0}}).row
     assert row["status"] == "completed"
+
+
+@pytest.mark.parametrize(
+    ("frame", "period", "lost"),
+    [(0.1, 0.05, 0.0), (0.066, 0.02, 0.0), (0.066, 0.02, 0.2), (0.067, 0.05, 0.0), (0.05, 0.05, 0.05)],
+)
+def test_the_period_of_a_camera_and_lost_frames_are_told_apart(frame, period, lost):
+    rows = np.ceil(np.arange(0.0, 60.0, frame) / period - 1e-9).astype(int)
+    rows = rows[np.random.default_rng(0).random(len(rows)) >= lost]
+    valid = np.isin(np.arange(round(60.0 / period)), rows)
+    valid[301] |= frame == 0.1  # an odd frame
+    log = logged()[0]._replace(spec=replace(logged()[0].spec, period=period), valid=valid)
+    assert frame_period(log) == pytest.approx(frame, rel=0.01)
+    assert lost_share(log) == pytest.approx(lost, abs=0.03)
+
+
+def test_a_twin_has_the_rate_and_the_latency_of_a_camera_that_is_no_multiple_of_the_control_period(tmp_path):
+    settings = {"kinematic": {"sensing": {"latency": 0.08, "frame_period": 0.066}}, "run": {"period": 0.02}}
+    made = run("docs/examples/excite.py", task="random", robot="ur5e", seed=SEED,
+               settings=settings | {"random": {"duration": 20.0}})  # fmt: skip
+    log = read_log(replace(logged()[0].spec, period=0.02), made.steps)
+    robot = identify(log, find_robot("ur5e").nominal)
+    twin = find_robot(str(write(tmp_path, twin_text(robot, log, None, ("ur5e", "position")), "twin.toml"))).twin
+    given = twin.plant_settings(KinematicConfig(), 0.02)["sensing"]
+    assert given["frame_period"] == 0.066
+    assert given["latency"] == pytest.approx(0.08, abs=0.003)
+    assert given["drop_probability"] == 0.0
 
 
 @pytest.mark.slow
