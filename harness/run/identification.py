@@ -47,6 +47,7 @@ EXTRAS: Final = ("backlash", "ripple", "drift", "swing_sin", "swing_cos", "compl
 EXPOSURE: Final = ("latency", *EXTRAS[:5])  # which joints a frame shows
 ARM: Final = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
+MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
 TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
 SWINGS: Final = np.geomspace(1.0, 20.0, 120)  # [s] periods of the search
@@ -71,6 +72,16 @@ class Log(NamedTuple):
     features: FloatArray  # (k, m) [unit of the feature]
     valid: BoolArray  # (k,) of rows with a new frame
     commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
+
+    def wrapped_joint(self) -> str:
+        """Name a joint that jumps by a turn from one row to the next, far beyond its speed; empty for none."""
+        jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
+        jumps[np.abs(jumps - 2.0 * np.pi) > MAX_OFF_TURN] = 0.0
+        row, joint = np.unravel_index(int(jumps.argmax()), jumps.shape)
+        if jumps[row, joint] <= 2.0 * self.spec.joint_velocity_limit[joint] * self.spec.period:
+            return ""
+        where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
+        return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)"
 
 
 def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:

@@ -52,7 +52,7 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
         model: nominal robot under the sensing of the log.
         others: nominal models of other arms with as many joints, by name.
     """
-    found = _units(log, model) or _repeats(log)
+    found = _units(log, model) or log.wrapped_joint() or _repeats(log)
     if found:
         return found, None
     robot = identify(log, model)

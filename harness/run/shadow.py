@@ -88,6 +88,8 @@ class LoggedPlant(Plant):
             raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
         if beyond.max() > MAX_EXCESS:
             remark(where)
+        if wrapped := self.log.wrapped_joint():
+            raise ConfigurationError(wrapped)
         for kind, values in (("feature", self.log.features), ("reference", self.reference)):
             sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
             far, size = int(sizes.argmax()), float(sizes.max())

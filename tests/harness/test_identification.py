@@ -207,6 +207,11 @@ def reversed_elbow(log):
     return log._replace(joints=log.joints * np.where(np.arange(6) == ELBOW, -1.0, 1.0))
 
 
+def wrapped(log):
+    q = log.joints + (0.0, 0.0, 0.0, 0.0, np.pi - log.joints[60, 4], 0.0)
+    return log._replace(joints=(q + np.pi) % (2.0 * np.pi) - np.pi)
+
+
 def mirrored(log):
     return log._replace(features=log.features * (1.0, -1.0, 1.0))
 
@@ -234,6 +239,7 @@ MISTAKES = {
     "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the begin"),
     "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
     "repeated": (repeated, r"25% of the frames repeat the one before although the arm moves, first in row \d+"),
+    "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
     "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "likely in degrees; write joint positions"),
     "millimetres": (lambda log: log._replace(features=1e3 * log.features), "likely in mm; write them in m"),
 }

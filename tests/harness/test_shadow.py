@@ -138,6 +138,7 @@ JOINTS, FEATURES = "joint_position_", ("feature_x", "feature_y", "feature_z", "r
 SLIPS = {  # name -> begin of the columns, what happens to them, the message; and whether it is a refusal
     "degrees": (JOINTS, np.degrees, "rad, beyond its range of .*; if the log is in degrees, write it in rad", True),
     "millimetres": (FEATURES, lambda y: 1000.0 * y, "if the log is in mm, write it in m", True),
+    "wrapped": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi), "unwrap it", True),
     "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
     "sign": (JOINTS, np.negative, "move otherwise than this robot's at these joints", False),
     "kilometres": (FEATURES, lambda y: y / 1000.0, "move otherwise than this robot's at these joints", False),
