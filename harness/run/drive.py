@@ -1,5 +1,6 @@
 """Delay and lag of a drive, from commands and joint positions of a log: τ v̇ = u(t − d) − v."""
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -10,6 +11,14 @@ from servobench.plant.contract.checks import FloatArray
 
 MAX_LAG: Final = 0.5  # [s] of commands and joints
 APART: Final = 1.05  # [1] ratio of the largest speeds of commands and joints, from which they may be clipped elsewhere
+SUSPECT: Final = 0.1  # [1] share of the motion that a drive leaves, from which commands may be mistaken
+MAX_LEFT: Final = 0.5  # [1] of the motion of a drive that is told
+SHIFTS: Final = (0.0, 0.1, 0.2, 0.3)  # [s] by which joints may follow their commands
+MIN_ALIKE: Final = 0.7  # [1] correlation of a joint with a command that it follows
+LESS: Final = 0.6  # [1] of it, with its own command
+MIN_MOTION: Final = 0.05  # [rad] of a joint that moves
+MAX_SPEEDS: Final = 20.0  # [1] ratio of commands and joint speeds in one unit
+SAME: Final = 0.1  # [rad] by which commands may be apart from joint positions
 MIN_GAIN: Final = 0.5  # [1] share of the squared errors that another level of clipping leaves at most
 
 
@@ -26,16 +35,16 @@ class Response(NamedTuple):
 
 
 def command_response(log: Log) -> Response | None:
-    """Return delay and lag of the joints; None for a log without commands, or without motion.
+    """Return delay and lag of the joints; None for a log that does not tell them, see `untold_response`.
 
     Where joints and commands reach other speeds, and clipping at another level than the robot's limits leaves less of
     the motion, the level is a third parameter.
     """
-    if log.commands is None or not np.ptp(log.commands, axis=0).any():
+    first = int(np.ceil(2.0 * MAX_LAG / log.spec.period))
+    if (logged := log.commands) is None or len(logged) < 2 * first or not np.ptp(logged[first:], axis=0).any():
         return None
-    spec, steps, logged = log.spec, np.diff(log.joints, axis=0), log.commands
+    spec, steps = log.spec, np.diff(log.joints, axis=0)
     limit, reached = spec.joint_velocity_limit, np.abs(steps).max() / spec.period
-    first = int(np.ceil(2.0 * MAX_LAG / spec.period))
 
     def errors(x: FloatArray) -> FloatArray:
         bound = x[2] if len(x) > 2 else limit
@@ -54,13 +63,56 @@ def command_response(log: Log) -> Response | None:
         if clipped.cost < MIN_GAIN * solved.cost:
             solved = clipped
             level = float(clipped.x[2]) if clipped.x[2] < np.abs(logged).max() else np.inf
-    left = solved.fun.reshape(-1, spec.n)
-    variance = float(np.mean(left**2)) * correlation_time(left) + 1e-16
+    left, moved, late = (float(np.mean(each**2)) for each in (solved.fun, steps[first:], solved.jac[:, 0]))
+    share = math.sqrt(left / max(moved, 1e-30))
+    lost = share > MAX_LEFT or max(solved.x[:2]) > 0.99 * MAX_LAG or late == 0.0
+    if lost or (share > SUSPECT and command_mistake(log)):
+        return None
+    variance = left * correlation_time(solved.fun.reshape(-1, spec.n)) + 1e-16
     covariance = variance * np.linalg.pinv(solved.jac.T @ solved.jac)[:2, :2]
     # What is left of a drive that is no first-order lag may be one of the delay, which the lag makes up for.
-    covariance += 0.25 * np.mean(left**2) / np.mean(solved.jac[:, 0] ** 2) * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    share = float(np.sqrt(np.mean(left**2) / np.mean(steps[first:] ** 2)))
+    covariance += 0.25 * left / late * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return Response(float(solved.x[0]), float(solved.x[1]), covariance, share, level)
+
+
+def untold_response(log: Log) -> str:
+    """Return why a log tells no delay and lag."""
+    if log.commands is None:
+        return "the log has no command of each joint"
+    return command_mistake(log) or f"none up to {MAX_LAG:g} s explain the joint motion by the commands"
+
+
+def command_mistake(log: Log) -> str:
+    """Name what is likely wrong with the commands of a log; empty for nothing, or no commands."""
+    if (u := log.commands) is None:
+        return ""
+    q, names = log.joints, log.spec.joint_names
+    if np.allclose(u, q, atol=SAME):
+        return "commands of the log are its joint positions, and wanted are velocities"
+    speed = np.diff(q, axis=0) / log.spec.period
+    if (ratio := float(np.linalg.norm(u)) / max(float(np.linalg.norm(speed)), 1e-9)) > MAX_SPEEDS and len(q) > 1:
+        return f"commands are {ratio:.0f} times the joint speeds; if they are in deg/s, write them in rad/s"
+    shifts = [k for each in SHIFTS if (k := round(each / log.spec.period)) < len(q) - 2]
+    alike = np.array([_correlations(speed[k:], u[: len(speed) - k]) for k in shifts])
+    moving = np.ptp(q, axis=0) > MIN_MOTION
+    most, least = alike.max(axis=0, initial=0.0), alike.min(axis=0, initial=0.0)
+    size = np.maximum(most, -least)
+    found = [
+        f"{names[i]} follows the command of {names[j]}"
+        for i, j in enumerate(size.argmax(axis=1).tolist())
+        if moving[i] and size[i, i] < LESS * size[i, j] > LESS * MIN_ALIKE
+    ]
+    against = moving & (np.diag(least) < -MIN_ALIKE) & (np.diag(most) < LESS * -np.diag(least))
+    found += [f"{name} moves against its command" for name, wrong in zip(names, against, strict=True) if wrong]
+    every = "every joint moves against its command" if against.sum() == moving.sum() > 1 else ""
+    return f"{every or ', '.join(found)}; give each joint its own command, in its direction" if found else ""
+
+
+def _correlations(values: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the correlations of n columns with n others, (n, n); 0 for those that do not change."""
+    values, others = (each - each.mean(axis=0) for each in (values, others))
+    sizes = np.linalg.norm(values, axis=0)[:, None] * np.linalg.norm(others, axis=0)
+    return np.asarray(values.T @ others / np.maximum(sizes, 1e-9))
 
 
 def joint_steps(commands: FloatArray, period: float, delay: float, lag: float) -> FloatArray:

@@ -18,6 +18,7 @@ import pandas as pd
 
 from servobench.controllers.algebra import nearest_rotation
 from servobench.harness.run.contract import held_to_contract
+from servobench.harness.run.drive import command_mistake
 from servobench.harness.run.experiment import build
 from servobench.harness.run.identification import LOG, read_log
 from servobench.harness.run.log import StepLog, Steps
@@ -174,11 +175,8 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         _check_delay(rows, ahead)
     if (commands := plant.log.commands) is not None:
         steps[[LOGGED + name for name in column_names(spec)[COMMAND]]] = commands
-        if (np.abs(commands) > 5.0 * spec.joint_velocity_limit).any():
-            reach = f"commands of the log reach {np.abs(commands).max():g} rad/s"
-            remark(f"{reach}; if they are in deg/s, write them in rad/s")
-        if np.allclose(commands, plant.log.joints, atol=MAX_EXCESS):
-            remark("commands of the log are its joint positions, and wanted are velocities")
+        if wrong := command_mistake(plant.log):
+            remark(wrong)
     return steps
 
 

@@ -8,15 +8,13 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from servobench.harness.config.description import toml
-from servobench.harness.run.drive import Response
+from servobench.harness.run.drive import MIN_MOTION, SUSPECT, Response, untold_response
 from servobench.harness.run.identification import EXTRAS, OUTLIER, Identified, Log, kind_of, prior
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import TIMES
 
 MIN_DEVIATION: Final = 1e-4  # [s] of delay and lag, as they are printed
-STILL: Final = 0.05  # [rad] of motion, below which a joint hardly moves
-MAX_UNEXPLAINED: Final = 0.1  # [1] share of the joint motion that a lag of first order may leave
 SHOWN: Final = 0.05  # [1] of the largest entry of a direction, from which a parameter is named
 WHITE: Final = 3.0  # [1] deviations of a correlation from none, up to which residuals count as white
 CERTAIN: Final = 5.0  # [1] deviations from none of backlash, ripple, a soft tool and the like
@@ -64,12 +62,14 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
         f"residuals over time are {'white' if over_time < WHITE else 'not white'}, correlated over "
         f"{robot.correlation:.2g} frames; posture explains {max(0.0, over_posture):.1%} of their variance",
     ]
-    still = [name for name, each in zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True) if each < STILL]
+    still = [
+        name for name, each in zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True) if each < MIN_MOTION
+    ]
     if still:
         lines.append(f"joints that hardly move: {', '.join(still)}")
     if response is None:
-        lines.append("not told: delay and lag of commands, as the log has none")
-    elif response.unexplained > MAX_UNEXPLAINED:
+        lines.append(f"not told: delay and lag, as {untold_response(log)}")
+    elif response.unexplained > SUSPECT:
         left = f"{response.unexplained:.0%} of the joint motion"
         lines.append(f"delay and lag leave {left}: the drive is no first-order lag")
     if response is not None and response.level < math.inf:

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from kit.own import write
 from servobench import run
-from servobench.harness.run.drive import command_response, joint_steps
+from servobench.harness.run.drive import command_mistake, command_response, joint_steps, untold_response
 from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.identification import (
     _Problem,
@@ -106,7 +106,7 @@ def test_delay_and_lag_are_those_of_the_drive():
     response = command_response(log)
     assert (response.delay, response.lag) == pytest.approx((DELAY, LAG), abs=1e-5)
     assert response.unexplained < 1e-3
-    assert command_response(log._replace(commands=None)) is None
+    assert command_mistake(log) == ""
 
 
 def driven(commands, period=0.05):
@@ -124,6 +124,27 @@ def test_delay_and_lag_are_found_although_commands_are_clipped_elsewhere(gain, c
     assert response.level == pytest.approx(level, rel=1e-3)
     lines = "\n".join(remarks(log, identified(), response))
     assert ("commands act as if clipped at " in lines) is (level < np.inf)
+
+
+COMMANDS = {  # of a log -> mistaken ones, and the line on them
+    "missing": (lambda log: None, "the log has no command of each joint"),
+    "constant": (lambda log: np.ones_like(log.joints), "none up to 0.5 s explain the joint motion by the commands"),
+    "positions": (lambda log: log.joints, "commands of the log are its joint positions"),
+    "degrees": (lambda log: np.degrees(log.commands), r"commands are 5\d times the joint speeds; if they are in deg/s"),
+    "exchanged": (lambda log: log.commands[:, [0, 2, 1, 3, 4, 5]], "shoulder_lift follows the command of elbow, elbow"),
+    "negated": (lambda log: -log.commands, "every joint moves against its command; give each joint its own"),
+    "reversed": (lambda log: log.commands * (1, 1, -1, 1, 1, 1), "^elbow moves against its command; give"),
+    "late": (lambda log: np.roll(log.commands, -20, axis=0), "none up to 0.5 s explain the joint motion"),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_delay_and_lag_are_told_by_mistaken_commands(name):
+    change, line = COMMANDS[name]
+    log = logged()[0]
+    log = log._replace(commands=change(log))
+    assert command_response(log) is None
+    assert re.search(line, untold_response(log))
 
 
 def test_a_drive_that_is_no_first_order_lag_widens_the_interval_of_the_delay():
@@ -277,10 +298,10 @@ def test_what_is_printed_names_units_and_what_the_log_does_not_tell():
     table = estimates(identified(), command_response(log)).set_index("parameter")
     assert table.loc["latency", "unit"] == "ms"
     assert float(table.loc["latency", "estimate"]) == pytest.approx(80.0, abs=2.0)
-    lines = "\n".join(remarks(log, identified(), None))
+    lines = "\n".join(remarks(log._replace(commands=-log.commands), identified(), None))
     assert "residuals over time are white" in lines
     assert "not told: zero_shoulder_pan with camera_turn_" in lines
-    assert "delay and lag of commands, as the log has none" in lines
+    assert "not told: delay and lag, as every joint moves against its command" in lines
     assert "joints that hardly move: wrist_3" in "\n".join(remarks(still, identified(), None))
     values = np.where(np.array(identified().names) == "zero_elbow", 1.0, identified().values)
     assert "far from the nominal robot: zero_elbow" in "\n".join(
