@@ -28,7 +28,7 @@ TIE: Final = 1.1  # [1] misfit over the best one, up to which a log cannot tell 
 SCREENED: Final = 6  # mistakes that are looked at closely
 AT_ONCE: Final = 64  # logs without a mistake that are placed before a camera side by side
 FRAMES: Final = 150  # frames of a close look
-DRIFT: Final = 10.0  # [ms] over the log, from which a clock counts as drifting
+DRIFT: Final = 10.0  # [ms] at once or over the log, from which clocks are apart
 CERTAIN: Final = 6.0  # [1] standard deviations
 SEARCHES: Final = 20  # of joint zeros
 ANGLES: Final = np.radians([-120, -90, -60, -30, 30, 60, 90, 120, 180, -10, 10]).tolist()
@@ -61,7 +61,7 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
             return found, None
         other = identify(log, model, begin=_zeros(log, model))
         robot = other if _is_noise(log, other) else robot
-    found = _drift(log, robot)
+    found = _clocks(log, robot)
     if not is_explained(log, robot):
         known = dict(zip(robot.names, robot.values.tolist(), strict=True)) if _is_noise(log, robot) else {}
         found = _undone(log, model, others, known) or found
@@ -158,8 +158,12 @@ def _large_errors(log: Log, robot: Identified) -> str:
     return f"{found}: check order, directions and zeros of the joints, the axes of the camera, and whether it was moved"
 
 
-def _drift(log: Log, robot: Identified) -> str:
-    """Name clocks of which one gains on the other."""
+def _clocks(log: Log, robot: Identified) -> str:
+    """Name clocks of which one is behind the other, or gains on it."""
+    latency, deviation = robot.estimate("latency")
+    if 1e3 * latency < -max(CERTAIN * 1e3 * deviation, DRIFT):
+        before = f"frames come {-1e3 * latency:.0f} ms before the joints are where they show them"
+        return f"{before}, as clocks of camera and joints are apart: stamp both with one"
     drift, deviation = robot.estimate("drift")
     time, rates = log.time[robot.rows], robot.rates(log) * robot.inliers[:, None]
     shifts, speeds = np.sum(rates * robot.residuals, axis=1), np.sum(rates**2, axis=1)

@@ -242,6 +242,10 @@ def drifting(log):
     return log._replace(features=log.features - late * np.gradient(log.features, log.time, axis=0))
 
 
+def early(log):
+    return log._replace(features=np.roll(log.features, -3, axis=0), valid=log.valid & (log.time < 19.8))
+
+
 def moved(log):
     later = (log.time > 12.0)[:, None]
     return log._replace(features=log.features + later * (0.05, 0.0, 0.0))
@@ -258,6 +262,10 @@ MISTAKES = {
     "reversed": (reversed_elbow, "the direction of joint elbow is reversed"),
     "mirrored": (mirrored, "an axis of the camera is mirrored, or two are exchanged"),
     "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the begin"),
+    "early": (
+        early,
+        r"frames come (69|70) ms before the joints are where they show them, as clocks of camera and joints",
+    ),
     "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
     "repeated": (repeated, r"25% of the frames repeat the one before although the arm moves, first in row \d+"),
     "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
