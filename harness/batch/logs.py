@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
+from servobench.harness.config.description import restored
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.config.settings import Settings, nest
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, varied_in_row
@@ -73,7 +74,7 @@ def logged_in_folder(
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
     configuration = results.read_manifest(folder).get("configuration", {})
     read = ["run", row["plant"], row["task"], *([] if controller else [row["controller"]])]
-    sections = {name: nest(configuration.get(name, {})) for name in read}
+    sections = {name: nest(restored(configuration.get(name, {}))) for name in read}
     names = ("plant", "task", "mismatch", "robot", "sensing")
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant

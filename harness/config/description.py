@@ -95,6 +95,15 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any setting
     return value if isinstance(value, str | bool | int | None) else str(value)
 
 
+def restored(value: Any) -> Any:  # noqa: ANN401 - any setting
+    """Return a value that `plain` made, with numbers for "inf", "-inf" and "nan"."""
+    if isinstance(value, dict):
+        return {key: restored(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [restored(each) for each in value]
+    return float(value) if value in ("inf", "-inf", "nan") else value
+
+
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 WIDTH = 100  # characters of a line of comment
 HEAD = """\

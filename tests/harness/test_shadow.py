@@ -12,6 +12,7 @@ from kit.command import servobench
 from servobench import compare, run
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
 from servobench.harness.config.registry import choose_controller
+from servobench.harness.config.settings import flatten
 from servobench.harness.run.shadow import COMMAND, LOGGED, differences, predictions, shadow
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import remark
@@ -65,6 +66,13 @@ def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder,
     np.testing.assert_array_equal(commands(seen), commands(steps))
     assert (differences(seen)["difference, largest"] == 0.0).all()
     assert not seen["feature_valid"].all()
+
+
+def test_settings_without_a_limit_are_read_from_a_folder(tmp_path):
+    compare(["ukf_mpc"], tasks=["exp2"], seeds=[3], settings={"exp2": {"duration": 1.0}}, out=tmp_path / "runs")
+    resolved, steps = logged_in_folder(tmp_path / "runs", None, None)
+    assert np.inf in flatten(resolved.controller).values()
+    np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
 
 def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp_path, monkeypatch):
