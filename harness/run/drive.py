@@ -29,9 +29,7 @@ class Response(NamedTuple):
     lag: float  # [s]
     covariance: FloatArray  # of both, (2, 2)
     unexplained: float  # [1] share of the motion
-    level: (
-        float  # [rad/s] at which commands are clipped on their way; infinite for those within the limits of the robot
-    )
+    level: float  # [rad/s] at which commands are clipped on their way; infinite for the limits of the robot
 
 
 def command_response(log: Log) -> Response | None:
@@ -40,10 +38,10 @@ def command_response(log: Log) -> Response | None:
     Where joints and commands reach other speeds, and clipping at another level than the robot's limits leaves less of
     the motion, the level is a third parameter.
     """
-    first = int(np.ceil(2.0 * MAX_LAG / log.spec.period))
-    if (logged := log.commands) is None or len(logged) < 2 * first or not np.ptp(logged[first:], axis=0).any():
+    spec, steps, logged = log.spec, np.diff(log.joints, axis=0), log.commands
+    first = int(np.ceil(2.0 * MAX_LAG / spec.period))
+    if logged is None or not np.ptp(logged, axis=0).any() or not steps[first:].any():
         return None
-    spec, steps = log.spec, np.diff(log.joints, axis=0)
     limit, reached = spec.joint_velocity_limit, np.abs(steps).max() / spec.period
 
     def errors(x: FloatArray) -> FloatArray:
@@ -53,18 +51,17 @@ def command_response(log: Log) -> Response | None:
     def fit(*level: float) -> Any:  # noqa: ANN401 - of SciPy
         times = [(delay, lag) for delay in np.arange(0.0, 0.2, 0.1 * spec.period) for lag in (0.01, 0.03, 0.1)]
         best = min(times, key=lambda each: float(np.sum(errors(np.array([*each, *level])) ** 2)))
-        most = [2.0 * each for each in level]
-        bounds = [0.0, 1e-4, *(0.5 * each for each in level)], [MAX_LAG, MAX_LAG, *most]
+        bounds = [0.0, 1e-4, *np.multiply(0.5, level)], [MAX_LAG, MAX_LAG, *np.multiply(2.0, level)]
         return least_squares(errors, [*best, *level], bounds=bounds, x_scale=0.01, diff_step=[1e-4] * (2 + len(level)))
 
     solved, level = fit(), np.inf
-    if not 1.0 / APART < np.abs(np.clip(logged, -limit, limit)).max() / max(reached, 1e-9) < APART:
+    if not 1.0 / APART < np.abs(np.clip(logged, -limit, limit)).max() / reached < APART:
         clipped = fit(reached)
         if clipped.cost < MIN_GAIN * solved.cost:
             solved = clipped
             level = float(clipped.x[2]) if clipped.x[2] < np.abs(logged).max() else np.inf
     left, moved, late = (float(np.mean(each**2)) for each in (solved.fun, steps[first:], solved.jac[:, 0]))
-    share = math.sqrt(left / max(moved, 1e-30))
+    share = math.sqrt(left / moved)
     lost = share > MAX_LEFT or max(solved.x[:2]) > 0.99 * MAX_LAG or late == 0.0
     if lost or (share > SUSPECT and command_mistake(log)):
         return None
@@ -84,13 +81,13 @@ def untold_response(log: Log) -> str:
 
 def command_mistake(log: Log) -> str:
     """Name what is likely wrong with the commands of a log; empty for nothing, or no commands."""
-    if (u := log.commands) is None:
+    q, u, names = log.joints, log.commands, log.spec.joint_names
+    if u is None or len(q) < 3:
         return ""
-    q, names = log.joints, log.spec.joint_names
     if np.allclose(u, q, atol=SAME):
         return "commands of the log are its joint positions, and wanted are velocities"
     speed = np.diff(q, axis=0) / log.spec.period
-    if (ratio := float(np.linalg.norm(u)) / max(float(np.linalg.norm(speed)), 1e-9)) > MAX_SPEEDS and len(q) > 1:
+    if (ratio := float(np.linalg.norm(u)) / max(float(np.linalg.norm(speed)), 1e-9)) > MAX_SPEEDS:
         return f"commands are {ratio:.0f} times the joint speeds; if they are in deg/s, write them in rad/s"
     shifts = [k for each in SHIFTS if (k := round(each / log.spec.period)) < len(q) - 2]
     alike = np.array([_correlations(speed[k:], u[: len(speed) - k]) for k in shifts])

@@ -126,6 +126,13 @@ def test_delay_and_lag_are_found_although_commands_are_clipped_elsewhere(gain, c
     assert ("commands act as if clipped at " in lines) is (level < np.inf)
 
 
+def test_joints_that_do_not_move_and_a_log_of_a_row_tell_nothing_of_a_drive():
+    log = logged()[0]
+    assert command_response(log._replace(joints=np.zeros_like(log.joints))) is None
+    assert command_response(log._replace(joints=log.joints[:10], commands=log.commands[:10])) is None
+    assert command_mistake(log._replace(joints=log.joints[:1], commands=log.commands[:1])) == ""
+
+
 COMMANDS = {  # of a log -> mistaken ones, and the line on them
     "missing": (lambda log: None, "the log has no command of each joint"),
     "constant": (lambda log: np.ones_like(log.joints), "none up to 0.5 s explain the joint motion by the commands"),
