@@ -27,12 +27,14 @@ from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import numbers_of
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import COMMAND, BoolArray, PlantSpec, column_names
 from servobench.plant.robot.hand_eye import RobotModel, rotation_matrix
 from servobench.plant.robot.mechanics import MechanicsConfig, transmitted
 from servobench.plant.robot.twin import CAMERA, LENS, ball_rates, deviated, parameter_names
 
 LOG: Final = "the log"  # in error messages
+VELOCITY: Final = COMMAND.removesuffix("_command")  # as commands are misnamed
 MAX_LATENCY: Final = 0.25  # [s]
 LATENCY_STEP: Final = 0.0125  # [s] of the first search
 MIN_FRAMES: Final = 50
@@ -94,7 +96,10 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
     joints, features = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
     given = "feature_valid" in table
     valid = numbers_of(LOG, table, ["feature_valid"])[:, 0] != 0.0 if given else np.ones(len(rows), dtype=np.bool_)
-    commands = numbers_of(LOG, table, names[COMMAND]) if set(names[COMMAND]) <= set(table) else None
+    lacking = [name for name in names[COMMAND] if name not in table]
+    if lacking and any(str(name).startswith(VELOCITY) for name in table):
+        remark(f"the log has columns {VELOCITY}_… but no {', '.join(lacking)}: commands are left out")
+    commands = None if lacking else numbers_of(LOG, table, names[COMMAND])
     log = Log(spec, np.asarray(spec.period * rows), joints, features, valid, commands)
     if (count := len(frames_of(log))) < least:
         after = f"after the first {MAX_LATENCY:g} s"

@@ -25,6 +25,7 @@ from servobench.harness.run.preflight import mistakes
 from servobench.harness.run.request import RunRequest, find_sensing, read_mismatch
 from servobench.harness.run.twin_file import estimates, frame_period, lost_share, remarks, sensor, twin_text
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.urdf import arm_tree, text
 from servobench.plant.robot.catalogue import find_robot
@@ -152,6 +153,15 @@ def test_no_delay_and_lag_are_told_by_mistaken_commands(name):
     log = log._replace(commands=change(log))
     assert command_response(log) is None
     assert re.search(line, untold_response(log))
+
+
+@pytest.mark.parametrize("name", ["joint_velocity_elbow_rad_s", "elbow"])
+def test_commands_that_are_missing_or_misnamed_are_named(name, caplog):
+    log, table, _ = logged()
+    own = "joint_velocity_command_elbow_rad_s"
+    remark.cache_clear()
+    assert read_log(log.spec, table.rename(columns={own: name})).commands is None
+    assert f"the log has columns joint_velocity_… but no {own}: commands are left out" in caplog.text
 
 
 def test_a_drive_that_is_no_first_order_lag_widens_the_interval_of_the_delay():
