@@ -181,10 +181,13 @@ def identify(
         say(str(error))
         sys.exit(FAILED)
     request = resolved.request
+    setup, own = find_sensing(request.sensing), find_robot(request.robot)
+    if own.twin:
+        wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
+        raise ConfigurationError(f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}")
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
     experiment.plant.close()
-    setup, own = find_sensing(request.sensing), find_robot(request.robot)
     same = [name for name in ROBOTS if name != request.robot and find_robot(name).n == own.n]
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
         mistake, found = mistakes(rows, setup.nominal(own), {name: setup.nominal(find_robot(name)) for name in same})

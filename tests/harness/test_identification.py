@@ -475,6 +475,15 @@ def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path,
     assert row["outcome"] == "settled"
 
 
+def test_a_twin_of_a_twin_is_refused_before_the_work(refusal_of, tmp_path):
+    logged()[1].to_csv(tmp_path / "robot.csv", index=False)
+    pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [0, 0, 0, 1]}"
+    twin = write(tmp_path, f"robot = '{ROBOT}'\n[camera]\n{pose}\n", "twin.toml")
+    line = refusal_of("identify", tmp_path / "robot.csv", "--robot", twin)
+    assert "is itself a twin, which no twin can deviate from: identify a table" in line
+    assert f"with --robot {ROBOT}" in line
+
+
 def test_the_command_names_a_mistake_with_exit_code_1_and_writes_nothing(output_of, tmp_path):
     _, table, _ = logged()
     log, out = tmp_path / "robot.csv", tmp_path / "twin.toml"
