@@ -17,6 +17,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import RobotModel
 
 MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the nominal robot
+UNITS: Final = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
 MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
@@ -117,7 +118,7 @@ def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
 
 
 def _units(log: Log, model: RobotModel) -> str:
-    """Name joints that are likely in degrees and features that are likely in mm."""
+    """Name joints that are likely in degrees and features that are likely in a smaller unit than m."""
     spec, q = log.spec, log.joints
     beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
     if beyond.max() > math.pi:
@@ -128,7 +129,8 @@ def _units(log: Log, model: RobotModel) -> str:
     moved, made = (np.linalg.norm(_spread(each)) for each in (log.features[rows], np.asarray(model.feature(q[rows]))))
     if spec.feature.unit == "m" and moved > MAX_RATIO * made:
         found = f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m"
-        return f"{found}: they are likely in mm; write them in m"
+        unit = min(UNITS, key=lambda unit: abs(math.log(moved / max(float(made), 1e-9) * UNITS[unit])))
+        return f"{found}: they are likely in {unit}; write them in m"
     return ""
 
 
