@@ -1,6 +1,7 @@
 """A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
-from servobench.harness.config.description import restored
+from servobench.harness.config.description import plain, restored
 from servobench.harness.config.registry import MAPPED
-from servobench.harness.config.settings import Settings, nest
-from servobench.harness.run.request import OWN_ROBOT, RunRequest, varied_in_row
-from servobench.harness.run.resolution import ResolvedRun, resolve
+from servobench.harness.config.settings import Settings, flatten, nest
+from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings, varied_in_row
+from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import numbers_of, read_table
 from servobench.plant.contract.settings import suggest
@@ -24,6 +25,9 @@ TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
 CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plants, controllers and set-ups
 TASK: Final = "circle"  # likewise, without effect
+RENAMED: Final = {  # counts of control periods up to 0.2.0 -> times
+    f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")
+}
 
 
 class UnevenRows(ConfigurationError):
@@ -72,9 +76,7 @@ def logged_in_folder(
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
-    configuration = results.read_manifest(folder).get("configuration", {})
-    read = ["run", row["plant"], row["task"], *([] if controller else [row["controller"]])]
-    sections = {name: nest(restored(configuration.get(name, {}))) for name in read}
+    manifest = results.read_manifest(folder)
     names = ("plant", "task", "mismatch", "robot", "sensing")
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
@@ -84,7 +86,32 @@ def logged_in_folder(
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
     request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)
-    return resolve(request, Settings(sections)), steps
+    return resolve(request, _settings_of(request, manifest, own=not controller)), steps
+
+
+def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool) -> Settings:
+    """Return the settings with which a run was made, of its controller if that is its `own`.
+
+    Those of the plant are the ones that the run did not have by default or by its mismatch.
+    """
+    told, changed, name = manifest.get("configuration", {}), manifest.get("changed") or {}, request.plant
+    read = ["run", name, request.task, *([request.controller] if own else [])]
+    period = dict(request.varied).get("run.period", told.get("run", {}).get("period", RunSettings.period))
+    flat = {
+        each: {
+            RENAMED.get(key, key): period * value if key in RENAMED else value
+            for key, value in restored(told.get(each, {})).items()
+        }
+        for each in read
+    }
+    usual = plain(flatten(resolve_sections([request], Settings())[name]))
+    flat[name] = {
+        key: value
+        for key, value in flat[name].items()
+        if (told[name][key] != usual.get(key) or f"{name}.{key}" in changed)
+        and key not in request.mismatch.plant_settings
+    }
+    return Settings({each: nest(values) for each, values in flat.items()})
 
 
 def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tuple[ResolvedRun, pd.DataFrame]:

@@ -11,6 +11,7 @@ from kit.broken_controllers import stepping
 from kit.command import servobench
 from servobench import compare, run
 from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+from servobench.harness.batch.results import read_manifest, write_manifest
 from servobench.harness.config.registry import choose_controller
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.shadow import COMMAND, LOGGED, differences, predictions, shadow
@@ -72,6 +73,21 @@ def test_settings_without_a_limit_are_read_from_a_folder(tmp_path):
     compare(["ukf_mpc"], tasks=["exp2"], seeds=[3], settings={"exp2": {"duration": 1.0}}, out=tmp_path / "runs")
     resolved, steps = logged_in_folder(tmp_path / "runs", None, None)
     assert np.inf in flatten(resolved.controller).values()
+    np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
+
+
+def test_settings_are_read_from_a_folder_that_counts_probing_in_periods(tmp_path):
+    sections = {"exp2": {"duration": 4.0}, "ukf_mfac": {"initial": {"source": "probe"}}}
+    world = "lab+outliers=5%"  # which sets some of the plant's settings
+    compare(["ukf_mfac"], tasks=["exp2"], mismatches=[world], seeds=[3], settings=sections, out=tmp_path / "runs")
+    manifest = read_manifest(tmp_path / "runs")
+    told = manifest["configuration"]["ukf_mfac"]
+    for word, count in (("probe", 2), ("settle", 7), ("average", 3)):
+        assert told.pop(f"initial.{word}_time") == pytest.approx(count * 0.05)
+        told[f"initial.{word}_periods"] = count
+    write_manifest(tmp_path / "runs", manifest)
+    resolved, steps = logged_in_folder(tmp_path / "runs", None, None)
+    assert (resolved.plant.sensing.outliers, resolved.plant.sensing.latency) == (0.05, 0.095)
     np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
 
