@@ -89,6 +89,7 @@ def robustness(
 
     The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
+    from servobench.harness.batch import results
     from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.robustness import batch_of_map, find_lines, make_map
@@ -101,6 +102,7 @@ def robustness(
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")
+    judge(out, results.iterate_runs(out, ("status",)), strict=False)
 
 
 def suite(

@@ -22,6 +22,7 @@ from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.seeds import named_seed
+from servobench.plant.contract.settings import remark
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -30,6 +31,7 @@ from servobench.plant.robot.robot import Robot
 
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
 SEEN_DEPTH = 0.05  # [m] behind a surface at which a trail still counts as in front: it begins within the ball
+MAX_APART = 0.01  # [m] of the ball from that of the rigid arm, up to which a film says nothing
 ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
 HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
 
@@ -89,8 +91,12 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
         before, after = points[:moved_from], points[moved_from:]
         return np.concatenate([model.to_base(before), (moved or model).to_base(after)])
 
-    reference = track.vectors("reference_")
-    return LoggedRun(track, robot, model, moved, moved_from, q, in_base(ball), in_base(reference))
+    reference, true = track.vectors("reference_"), in_base(ball)
+    apart = float(np.nanmax(np.linalg.norm(model.to_base(model.feature(q)) - true, axis=1), initial=0.0))
+    if apart > MAX_APART:
+        why = "films have no play of gears, no flexible tool and no camera that turns"
+        remark(f"run {run_id}: the ball was up to {apart:.2g} m from where it is drawn, as {why}")
+    return LoggedRun(track, robot, model, moved, moved_from, q, true, in_base(reference))
 
 
 def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:

@@ -147,8 +147,8 @@ def _run(experiment: Experiment) -> ReferenceRun:
     )
 
 
-def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray | None = None) -> Product:
-    """Return the true arm of a run ready for export, with `words` on its mismatch; it begins at `home`, (n,) [rad].
+def arm_product(request: RunRequest, words: str, fmi: int = 2, **actuation: Any) -> Product:  # noqa: ANN401
+    """Return the true arm of a run ready for export, with `words` on its mismatch and fields of its `Actuation`.
 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
@@ -158,8 +158,8 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, home: FloatArray 
         remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
         raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     robot, (true, *_) = find_robot(request.robot), draw_robot(request)
-    actuation = default_actuation(robot) if home is None else replace(default_actuation(robot), home=home)
-    return product(ExportOptions(fmi, true, actuation, mismatch=words, robot=robot))
+    usual = replace(default_actuation(robot), **actuation)
+    return product(ExportOptions(fmi, true, usual, mismatch=words, robot=robot))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
@@ -168,11 +168,18 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
     The plant begins where the run does; the reference of the controller starts as the target of the run.
 
     Raises:
-        ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
+        ConfigurationError: a name or setting that cannot be used, a setting of the plant that the arm does not have, or
+            a controller that has no exported form.
     """
     resolved = resolve(request, settings)
-    scenario, run = draw(resolved).scenario, resolved.run
+    for key in flatten(settings.sections.get(request.plant, {})):
+        if key.partition(".")[0] not in ("lag", "max_joint_speed", "joint_range", "mechanics"):
+            has = "the arm of an SSP is seen without noise and latency, and commanded a period later"
+            raise ConfigurationError(f"{has}: leave {request.plant}.{key} out")
+    scenario, run, config = draw(resolved).scenario, resolved.run, resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
-    plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", home=scenario.start)
+    words, own = f"{request.mismatch}, seed {request.seed}", {"lag": config.lag, "max_speed": config.max_joint_speed}
+    own |= {"joint_range": config.joint_range, "mechanics": config.mechanics, "home": scenario.start}
+    plant = arm_product(request, words, **own)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
     return plant, controller, scenario.duration

@@ -7,7 +7,7 @@ take longer, so that there is time to recover. The usual map has the axes `LINES
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -143,25 +143,30 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
     carry_out(Campaign(map_cells(batch, lines, moving), settings), out, how)
     limits: dict[str, float] = {}
     if any(line.axis == LATENCY for line in lines) and batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED:
-        limits = predicted_limits(batch.controllers, settings, batch.robot)
+        limits = predicted_limits(batch.controllers, settings, batch.robot, plant)
     column = pd.Series(limits, name="predicted_latency_limit_s")
     write_atomically(out / LIMITS, partial(column.to_csv, index_label="controller"))
     return draw_map(map_runs(out), out / FIGURES, limits)
 
 
-def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str = DEFAULT_ROBOT) -> dict[str, float]:
+def predicted_limits(
+    controllers: Sequence[str], settings: Settings, robot: str = DEFAULT_ROBOT, plant: str = "kinematic"
+) -> dict[str, float]:
     """Return from which latency on the loop of each composed controller is predicted to be unstable, in s.
 
-    The prediction is that of small motions of the nominal robot, of the plant `kinematic`, without mismatch.
+    The prediction is that of small motions of the nominal robot without mismatch, of the plant `kinematic` with those
+    settings of `plant` that it has, too.
     """
+    known = {field.name for field in fields(KinematicConfig)}
+    own = {key: value for key, value in settings.sections.get(plant, {}).items() if key in known}
     latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
-    run, plant = settings.resolve("run", RunSettings()), settings.resolve("kinematic", KinematicConfig())
+    run, config = settings.resolve("run", RunSettings()), Settings({plant: own}).resolve(plant, KinematicConfig())
     limits: dict[str, float] = {}
     for name in controllers:
         entry = find_controller(name)
         if entry.side_by_side:
-            config = settings.resolve(name, default_config(entry))
-            limits[name] = latency_border(config, name, latencies, run, plant, robot)
+            method = settings.resolve(name, default_config(entry))
+            limits[name] = latency_border(method, name, latencies, run, config, robot)
     return limits
 
 

@@ -31,8 +31,10 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
+from servobench.plant.robot.mechanics import MechanicsConfig
 
 PERIOD = 0.05
 JACOBIAN = np.random.default_rng(0).normal(size=(3, 6))
@@ -100,6 +102,17 @@ def test_an_mfac_controller_is_linearised_as_its_closed_form_says():
     gain = np.stack([mfac_step(J, each, -np.expm1(-3.25 * PERIOD), 0.02) for each in np.eye(3)], axis=-1) / PERIOD
     assert len(controller.A) == 0
     np.testing.assert_allclose(controller.D, np.hstack([-gain, np.zeros((6, 6)), gain]), atol=1e-7)
+
+
+def test_a_model_has_the_age_of_slow_frames_beside_the_latency_and_names_what_it_leaves_out(caplog):
+    remark.cache_clear()
+    sensing, mechanics = SensingConfig(latency=0.1, frame_period=0.4, jitter=0.2), MechanicsConfig(tool_frequency=12.0)
+    arm = arm_model(KinematicConfig(sensing=sensing, mechanics=mechanics), JACOBIAN, PERIOD)
+    assert (arm.latency, arm.age) == (0.1, pytest.approx(0.175))
+    late = ArmModel(JACOBIAN, PERIOD, arm.lag, arm.command_delay, 0.275)
+    for one, other in zip(arm.matrices(), late.matrices(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    assert "the linear model leaves out sensing.jitter, mechanics.tool_frequency: margins" in caplog.text
 
 
 def test_margins_of_a_single_channel_are_those_of_the_library():

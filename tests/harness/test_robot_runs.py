@@ -16,11 +16,12 @@ from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run import resolution as resolved
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
-from servobench.harness.run.export import arm_product
+from servobench.harness.run.export import arm_product, loop_products
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, fitted
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 from servobench.plant.kinematic import ENTRY
 from servobench.plant.robot.catalogue import find_robot
 
@@ -130,8 +131,26 @@ def test_worlds_without_gears_and_tool_are_refused_in_one_line():
         arm_product(RunRequest("kinematic", "regression_mfac", "circle", mismatch, 3), "words")
 
 
+def test_the_arm_of_a_loop_has_the_settings_of_its_plant_or_refuses_them():
+    request = RunRequest("kinematic", "rbf_pid:published", "target", "none", 2)
+    own = {"lag": 0.2, "max_joint_speed": 0.5, "mechanics": {"tool_frequency": 12.0}}
+    start = loop_products(request, Settings({"kinematic": own}))[0].description.start
+    assert [float(np.max(start[name])) for name in ("lag", "max_speed", "tool_frequency")] == [0.2, 0.5, 12.0]
+    with pytest.raises(ConfigurationError, match="commanded a period later: leave kinematic.sensing.latency out"):
+        loop_products(request, Settings({"kinematic": {"sensing": {"latency": 0.1}}}))
+
+
 def test_a_run_under_a_turning_camera_is_not_filmed():
     request = RunRequest("kinematic", "regression_mfac", "circle", "moderate+camera_turn=15deg", 3)
     result = run_experiment(request, Settings())
     with pytest.raises(ConfigurationError, match="cannot be shown: films have no camera that turns"):
         logged_run(result.row, result.steps)
+
+
+@pytest.mark.parametrize("setting", [{"sensing": {"camera_turn": 0.2}}, {"mechanics": {"tool_frequency": 12.0}}, {}])
+def test_a_film_whose_ball_is_elsewhere_than_the_arm_has_it_says_so(caplog, setting):
+    remark.cache_clear()
+    request = RunRequest("kinematic", "regression_mfac", "exp1", "moderate", 3)
+    result = run_experiment(request, Settings({"kinematic": setting, "exp1": {"duration": 3.0}}))
+    logged_run(result.row, result.steps)
+    assert ("films have no play of gears, no flexible tool and no camera that turns" in caplog.text) == bool(setting)

@@ -8,6 +8,7 @@ import pytest
 
 from kit.command import servobench
 from kit.folders import made_up_row
+from kit.own import WHOLE
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import Settings
@@ -103,6 +104,8 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, figures):
     limits = predicted_limits(["pid+true", "pid+constant", "nmpc_calibrated"], fast)
     assert 0.0 < limits["pid+true"] < 0.25 < limits["pid+constant"] == math.inf
     assert "nmpc_calibrated" not in limits
+    slow = Settings({**fast.sections, "fmu": {"lag": 0.5, "command_delay": 0.15}})
+    assert predicted_limits(["pid+true"], slow, plant="fmu")["pid+true"] < limits["pid+true"]
     draw_map(pd.DataFrame([row for name in limits for row in rows_of(LATENCY, name)]), tmp_path, limits)
     lines = [np.asarray(each.get_xdata()) for each in figures[0].axes[0].get_lines()]
     upright = [x[0] for x in lines if len(x) == 2 and x[0] == x[1]]
@@ -121,6 +124,15 @@ def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_rendered_arm
     words = ("--axes", LATENCY, "--plant", plant, "--controllers", "constant", "--seeds", "1", "--workers", "1")
     assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=0.2", "--out", str(tmp_path)) == 0
     assert pd.read_csv(tmp_path / "predicted_limits.csv")["controller"].to_list() == predicted
+
+
+def test_runs_of_a_map_that_failed_are_told(monkeypatch, tmp_path, capsys):
+    line = Line(LATENCY, "camera latency [ms]", (Magnitude(0.0, "ms"),))
+    monkeypatch.setattr(robustness, "KNOWN_LINES", {LATENCY: line})
+    (tmp_path / "bad.py").write_text(WHOLE.replace("np.zeros(self.n)", "np.zeros(self.n) / undefined"))
+    words = ("--axes", LATENCY, "--plant", "kinematic", "--controllers", str(tmp_path / "bad.py"), "--seeds", "2")
+    assert servobench(monkeypatch, "robustness", *words, "--workers", "1", "--out", str(tmp_path / "out")) == 0
+    assert "2 of 2 runs failed; why: " in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, figures):

@@ -24,6 +24,7 @@ from servobench.controllers.controller import Controller, JacobianFunction
 from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.analysis.loops.systems import ArmModel, StateSpace
+from servobench.harness.config.settings import flatten
 from servobench.harness.run.experiment import build
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
 from servobench.harness.run.request import find_robot
@@ -33,6 +34,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import map_arrays
 from servobench.plant.contract.sensing import without_disturbance
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command, Observation, trusted_observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -48,6 +50,7 @@ NEGLIGIBLE = 0.01  # [1] of the first error; rounding and slow learning may make
 DURATION = 20.0  # [s]
 MAX_LATENCY = 3.0  # [s] largest latency that is tried
 MAX_GAIN = 32.0  # largest factor that is tried
+LEFT_OUT = ("sensing.jitter", "sensing.latency_swing", "mechanics.backlash", "mechanics.tool_frequency")
 TIME_DIGITS = 3  # of a latency [s], as worlds advance in whole milliseconds
 STEP = 1e-6  # of a difference, in the unit of each number: a micrometre, a microradian
 RANK_TOLERANCE = 1e-6  # [1] a direction that is reached less than this counts as not reached
@@ -270,7 +273,8 @@ def warm_up(resolved: ResolvedRun) -> Warm:
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
     """Return the linear model of the kinematic plant with these settings and a Jacobian (m, n).
 
-    Frames that come less often than commands count as later by their mean additional age.
+    Frames that come less often than commands count as later by their mean additional age. A remark names settings that
+    the model leaves out.
 
     Raises:
         ConfigurationError: joints that overshoot, which the model does not have.
@@ -278,7 +282,10 @@ def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> A
     if config.overshoot > 0.0:
         raise ConfigurationError(f"kinematic.overshoot must be 0 for a linear model, got {config.overshoot:g}")
     age = max(config.sensing.frame_period - period, 0.0) / 2.0
-    return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency + age)
+    values = flatten(config)
+    if out := [name for name in LEFT_OUT if values[name] > 0.0]:
+        remark(f"the linear model leaves out {', '.join(out)}: margins and limits are those without")
+    return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency, age)
 
 
 def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:

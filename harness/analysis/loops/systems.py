@@ -97,11 +97,12 @@ class ArmModel:
     lag: float  # τ [s]; 0 for joints that have the commanded velocity at once
     command_delay: float  # D [s]
     latency: float  # ℓ [s]
+    age: float = 0.0  # by which frames are older on the mean, as they come less often than commands [s]; part of ℓ
 
     def matrices(self) -> StateSpace:
         """Return the system from u, (n,) rad/s, to deviations of measured feature and joint positions, (m + n,)."""
         joint, (m, n) = self._joint(), self.jacobian.shape
-        waiting = split(self.latency, self.period)[0] * m  # numbers of the frames under way
+        waiting = split(self.latency + self.age, self.period)[0] * m  # numbers of the frames under way
         joints, B, positions = (np.kron(each, np.eye(n)) for each in (joint.A, joint.B, joint.C[1:]))
         frames = block_diag(np.kron(joint.C[:1], self.jacobian), np.eye(waiting))  # exposed now, then under way
         A = np.vstack([np.pad(joints, ((0, 0), (0, waiting))), frames[:waiting]])
@@ -111,7 +112,7 @@ class ArmModel:
     def response(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Return how a joint answers its command at z, (k,): its position at the exposure and now, (k,) each."""
         joint = self._joint().response(z)[:, :, 0]
-        late, _ = split(self.latency, self.period)
+        late, _ = split(self.latency + self.age, self.period)
         return joint[:, 0] * z ** (-late), joint[:, 1]
 
     def _joint(self) -> StateSpace:
@@ -121,7 +122,7 @@ class ArmModel:
         where the latency has a part of a period.
         """
         waiting, part = split(self.command_delay, self.period)
-        _, early = split(self.latency, self.period)
+        _, early = split(self.latency + self.age, self.period)
         queue = waiting + (part > 0.0)
         every = np.eye(3 + queue + (early > 0.0))  # a row for each state, and the last one for u(k)
         position, motion, commands = every[0], every[:2], np.vstack([every[-1], every[2 : 2 + queue]])
