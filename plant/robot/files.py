@@ -326,14 +326,38 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     if any(inertial is None or not inertial.mass or not np.any(inertial.inertia) for inertial in own):
         further = "" if torque is not None else ", torque limits"
         return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}"
-    mass = np.array([inertial.mass for inertial in own], dtype=np.float64)
-    for link, each in zip(chain, mass.tolist(), strict=True):
-        read_value(f"link {link.joint.child!r}: mass", each, MASS, lambda: "kg")
-    poses = np.array([link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)])
-    R = poses[:, :3, :3]
-    inertia = np.array([_balanced(link.joint.child, each.inertia) for link, each in zip(chain, own, strict=True)])
-    links = estimate_links(arm, mass, torque, at_far_end(arm, poses[:, :3, 3], R @ inertia @ R.mT))
+    mass, centre, inertia = (np.array(each) for each in zip(*(_body(tree, chain, link) for link in chain), strict=True))
+    links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
     return links, "" if torque is not None else "estimated: torque limits"
+
+
+def _body(tree: Any, chain: list[Joint], link: Joint) -> tuple[float, FloatArray, FloatArray]:  # noqa: ANN401
+    """Return mass [kg], centre (3,) [m] and inertia (3, 3) [kg m²] of a link and of all that hangs on it.
+
+    These are links behind fixed joints, such as a tool, and behind joints that no controller moves, such as fingers.
+    """
+    inertials, onward = {each.name: each.inertial for each in tree.links}, {each.joint.name for each in chain}
+    waiting, met, parts = [(link.joint.child, link.aligned.T)], set[str](), list[tuple[float, FloatArray, FloatArray]]()
+    while waiting:
+        name, pose = waiting.pop()
+        met.add(name)
+        waiting += [
+            (joint.child, pose @ _pose(joint.origin))
+            for joint in tree.joints
+            if joint.parent == name and joint.name not in onward and joint.child not in met
+        ]
+        if (own := inertials[name]) is not None and own.mass:
+            read_value(f"link {name!r}: mass", float(own.mass), MASS, lambda: "kg")
+            placed = pose @ _pose(own.origin)
+            R, inertia = placed[:3, :3], _balanced(name, own.inertia) if np.any(own.inertia) else np.zeros((3, 3))
+            parts.append((float(own.mass), placed[:3, 3], R @ inertia @ R.T))
+    mass = sum(each for each, _, _ in parts)
+    centre = np.sum([each * place for each, place, _ in parts], axis=0) / mass
+    whole = np.zeros((3, 3))
+    for each, place, inertia in parts:
+        off = place - centre
+        whole += inertia + each * (off @ off * np.eye(3) - np.outer(off, off))
+    return mass, centre, whole
 
 
 def _balanced(link: str, given: FloatArray) -> FloatArray:

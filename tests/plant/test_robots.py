@@ -313,10 +313,18 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     read = robot_of(tmp_path, "written.urdf", written)
     postures = RNG.uniform(-3.0, 3.0, (5, 6))
     np.testing.assert_allclose(flange(read.arm, postures), flange(own.arm, postures), atol=1e-9)
-    np.testing.assert_allclose(read.links.mass, own.links.mass)
-    np.testing.assert_allclose(read.links.centre, own.links.centre, atol=1e-9)
+    np.testing.assert_allclose(read.links.mass, own.links.mass + np.array([0.0] * 5 + [0.002]))  # of flange and ball
+    np.testing.assert_allclose(read.links.centre[:-1], own.links.centre[:-1], atol=1e-9)
     assert "6 joints" in read.note
     assert "estimated: torque limits" in read.note
+
+
+def test_a_link_has_the_mass_of_all_that_hangs_on_it(tmp_path):
+    pytest.importorskip("yourdfpy")
+    links = robot_of(tmp_path, "arm.urdf", HEAVY).links
+    np.testing.assert_allclose(links.mass, [2.0, 4.0, 2.0, 6.0])  # a bridge; a hand with a finger
+    np.testing.assert_allclose(np.linalg.eigvalsh(links.inertia[0]), [0.01] * 3)
+    np.testing.assert_allclose(np.linalg.eigvalsh(links.inertia[1]), [0.02, 0.06, 0.06])  # 0.1 m on both sides
 
 
 @pytest.mark.slow
