@@ -9,7 +9,7 @@ of methods, the study of the aids and the spaces of tuning are made from these d
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, Literal, NoReturn, TypeAlias, TypeVar, get_type_hints
 
 from annotated_types import Le
 
@@ -101,7 +101,22 @@ SWITCHES: Final[Mapping[str, Switch]] = _marked(Switch)
 """The aids by name."""
 RANGES: Final[Mapping[str, Tuned]] = _marked(Tuned)
 """The numbers of the aids that are tuned, by name."""
-EQUIPPED: Final[Mapping[str, Any]] = {name: switch.equipped for name, switch in SWITCHES.items()}
+
+
+class _Fixed(dict[str, Any]):
+    """A dictionary that all share, and nobody changes."""
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError("servobench.EQUIPPED is shared; change a copy, {**servobench.EQUIPPED, 'posture': False}")
+
+    __setitem__ = __delitem__ = update = setdefault = pop = popitem = clear = __ior__ = _refuse
+
+    def __reduce__(self) -> tuple[type, tuple[dict[str, Any]]]:
+        """Return how a copy is made, which is a plain one."""
+        return dict, (dict(self),)
+
+
+EQUIPPED: Final[Mapping[str, Any]] = _Fixed({name: switch.equipped for name, switch in SWITCHES.items()})
 """The value of each aid in a best equipped method."""
 
 

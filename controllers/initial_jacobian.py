@@ -35,7 +35,7 @@ class InitialConfig:
     """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
     probe_step: Annotated[Positive, Usual(0.3)] = 0.03
     """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
-    probe_time: Annotated[Positive, Usual(2.0)] = 0.1
+    probe_time: Annotated[Positive, Usual(1.0)] = 0.1
     """[s] over which a probing move is spread."""
     settle_time: Delay = 0.35
     """[s] of rest before a feature counts."""

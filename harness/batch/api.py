@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, TypeAlias
 
+import numpy as np
 import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
@@ -137,7 +138,7 @@ def compare(
     _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
                  seeds=chosen)  # fmt: skip
     for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
-        if value is not None and not (isinstance(value, int | float) and value > 0):
+        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
             raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
@@ -153,7 +154,7 @@ def compare(
 
 def _seeds(given: object) -> Sequence[int]:
     """Return the seeds of an argument that counts or lists them."""
-    if isinstance(given, SupportsIndex):
+    if isinstance(given, SupportsIndex) and not getattr(given, "ndim", 0):  # an array has an index, too
         return range(operator.index(given))
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {given!r}")

@@ -121,7 +121,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as below `&` of a script and in some CI
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.pop("MPLBACKEND", None)  # nothing is drawn in a window, and Matplotlib takes no unknown one
-    if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdecimal():
+    if not (epoch := os.environ.get("SOURCE_DATE_EPOCH") or "0").isdecimal():
         _end(f"SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, got {epoch!r}; unset it")
     if not hasattr(os, "fork"):
         _end("runs on Linux and macOS; on Windows use the Windows Subsystem for Linux (WSL)")

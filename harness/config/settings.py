@@ -43,6 +43,7 @@ class Settings:
     Attributes:
         sections: section -> nested keys -> plain values as TOML gives them.
         assigned: those of `sections` that came as single assignments.
+        filed: section and dotted key of those that came from a file, which may hold every setting with its default.
 
     Raises:
         ConfigurationError: something else than sections with keys.
@@ -50,6 +51,7 @@ class Settings:
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     assigned: tuple[Assignment, ...] = ()
+    filed: frozenset[tuple[str, str]] = frozenset()
 
     def __post_init__(self) -> None:
         """Check that there are sections, and keys in them."""
@@ -87,13 +89,14 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")
+    filed = {(name, key) for name, section in sections.items() for key in flatten(section)}
     assigned: dict[tuple[str, str], Assignment] = {}
     for text in assignments:
         new = _assign(sections, text)
         if old := assigned.get((new.section, new.key)):
             raise ConfigurationError(f"--set gives {new.section}.{new.key} twice: {old.text} and {new.text}")
         assigned[new.section, new.key] = new
-    return Settings(sections, tuple(assigned.values()))
+    return Settings(sections, tuple(assigned.values()), frozenset(filed - assigned.keys()))
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass

@@ -6,6 +6,7 @@ run is refused only where no true robot of that mismatch could do it.
 """
 
 import contextlib
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -125,6 +126,15 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
             raise ConfigurationError(
                 f"its reference must be {wanted}, got shape {points.shape} and {points[:1].tolist()}"
             )
+        last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
+        if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:  # a move is judged by its settling
+            part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
+            raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
+        if name not in TASKS:
+            again: Any = task.scenario(setting)
+            starts: list[Any] = [scenario.start, again.start]
+            if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
+                raise ConfigurationError("its scenario differs from one call to the next; draw from setting.seed alone")
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
@@ -354,7 +364,9 @@ def _build_controller(run: ResolvedRun, knowledge: RobotKnowledge, true_model: C
                 true_camera_turn=true.camera_turn,
                 true_tool=true.tool,
             )
-        return entry.build(run.controller, knowledge)
+        frozen = getattr(type(run.controller), "__dataclass_params__", None)
+        mine = run.controller if frozen is not None and frozen.frozen else copy.deepcopy(run.controller)
+        return entry.build(mine, knowledge)  # runs share the settings, which a class of a user's may change
 
 
 def _check_times(resolved: ResolvedRun, duration: float) -> None:

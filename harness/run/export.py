@@ -34,7 +34,7 @@ from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw, draw_robot
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest, find_robot
-from servobench.harness.run.resolution import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections, select
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
@@ -171,11 +171,12 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
         ConfigurationError: a name or setting that cannot be used, a setting of the plant that the arm does not have, or
             a controller that has no exported form.
     """
-    resolved = resolve(request, settings)
-    for key in flatten(settings.sections.get(request.plant, {})):
+    sections = resolve_sections([request], settings)
+    resolved = select(request, sections)
+    for key in sorted(sections.given.get(request.plant, ())):
         if key.partition(".")[0] not in ("lag", "max_joint_speed", "joint_range", "mechanics"):
-            has = "the arm of an SSP is seen without noise and latency, and commanded a period later"
-            raise ConfigurationError(f"{has}: leave {request.plant}.{key} out")
+            has = "lag, limits and mechanics, and is seen without noise and latency and commanded a period later"
+            raise ConfigurationError(f"the arm of an SSP has {has}: leave {request.plant}.{key} out")
     scenario, run, config = draw(resolved).scenario, resolved.run, resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
     words, own = f"{request.mismatch}, seed {request.seed}", {"lag": config.lag, "max_speed": config.max_joint_speed}

@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
+
 from servobench.harness.config.registry import (
     controller_names,
     find_controller,
@@ -29,13 +31,19 @@ class Sections(dict[str, Any]):
 
     Attributes:
         user: overrides of the user's, which are among them.
-        given: their dotted keys by section.
+        given: their dotted keys by section, but for defaults that a file repeats.
     """
 
-    def __init__(self, sections: Mapping[str, Any], user: Settings) -> None:
+    def __init__(self, sections: Mapping[str, Any], user: Settings, defaults: Mapping[str, Any]) -> None:
         """Keep settings by section."""
         super().__init__(sections)
-        self.user, self.given = user, {name: frozenset(flatten(values)) for name, values in user.sections.items()}
+        self.user, self.given = user, dict[str, frozenset[str]]()
+        for name in sections.keys() & user.sections.keys() & defaults.keys():
+            usual, own = flatten(defaults[name]), flatten(sections[name])
+            told = (key for key in flatten(user.sections[name]) if key in own)
+            self.given[name] = frozenset(
+                key for key in told if (name, key) not in user.filed or not np.array_equal(own[key], usual[key])
+            )
         self._frames: dict[tuple[str, float], Varied] = {}
         self._changed: dict[tuple[str, Varied], Any] = {}
 
@@ -112,7 +120,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
     defaults |= {name: default_config(find_controller(name), model_known=robot.known) for name in controllers}
     defaults |= {name: fitted(name, robot) for name in tasks}
-    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings)
+    return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings, defaults)
 
 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass

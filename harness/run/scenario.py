@@ -7,7 +7,7 @@ A task is a frozen dataclass below `Task` with a default for every field. The de
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, Self, TypeAlias, get_args
 
 import numpy as np
 
@@ -34,7 +34,9 @@ class Scenario:
     lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
 
     def __post_init__(self) -> None:
-        """Check that the evaluated part is one of the run."""
+        """Check that the evaluated part is one of the run, and the kind."""
+        if self.kind not in get_args(TaskKind):
+            raise ValueError(f"kind must be one of {', '.join(get_args(TaskKind))}, got {self.kind!r}")
         if not 0.0 <= self.evaluate_from < self.duration:
             raise ValueError(f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s")
 

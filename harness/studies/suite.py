@@ -25,7 +25,7 @@ from servobench.harness.batch.plan import Cell as Run
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures import style
 from servobench.harness.run.outcome import ACHIEVED
-from servobench.harness.run.resolution import check_settings, resolve_sections
+from servobench.harness.run.resolution import check_settings, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
 from servobench.plant.contract.files import write_csv
@@ -56,8 +56,11 @@ def carry_out_suite(
     check_settings(settings, [name for each in requests for name in (each.plant, each.controller, each.task)])
     for cells in runs.values():
         check_effects(settings, [cell.request for cell in cells], steps=False)
-    whole = Settings({**settings.sections, SEEING: {"image": True, **settings.sections.get(SEEING, {})}})
-    resolve_sections(requests, whole)  # all challenges are checked before the first one runs
+    seeing = {SEEING: {"image": True, **settings.sections.get(SEEING, {})}}
+    whole = Settings({**settings.sections, **seeing}, filed=settings.filed)
+    sections = resolve_sections(requests, whole)
+    for request in requests:
+        select(request, sections)  # all challenges are checked before the first one runs
     tables = carry_out_parts({name: Campaign(own, whole) for name, own in runs.items()}, out, how)
     judged = pd.concat([judge(challenge, tables[challenge.name]) for challenge in challenges], ignore_index=True)
     write_csv(judged, out / RUNS)

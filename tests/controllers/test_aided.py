@@ -1,5 +1,7 @@
 """A controller of one's own with aids: the chain around it is that of a composed controller."""
 
+import copy
+import pickle
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,3 +118,10 @@ def test_what_are_no_aids_is_refused_in_one_line(aids, line):
 )
 def test_settings_say_which_aids_a_controller_has(values, words):
     assert describe_aids(values) == words
+
+
+def test_the_equipment_that_all_share_cannot_be_changed():
+    for change in (lambda: servobench.EQUIPPED.__setitem__("posture", False), lambda: servobench.EQUIPPED.update({})):
+        with pytest.raises(TypeError, match="servobench.EQUIPPED is shared; change a copy"):
+            change()
+    assert pickle.loads(pickle.dumps(EQUIPPED)) == copy.deepcopy(EQUIPPED) == {**EQUIPPED}

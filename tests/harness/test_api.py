@@ -66,7 +66,9 @@ def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):
 
 
 def test_a_seed_of_numpy_is_that_seed():
-    (seed,) = np.arange(3, 4)
+    (seed,) = seeds = np.arange(3, 4)
+    short = {"tasks": ["exp2"], "settings": {"exp2": {"duration": 0.5}}, "workers": np.int64(1)}
+    assert servobench.compare(["constant"], seeds=seeds, **short)["seed"].tolist() == [3]
     of_numpy, own = (
         servobench.run("constant", task="exp2", seed=each, settings={"exp2": {"duration": 0.5}}) for each in (seed, 3)
     )

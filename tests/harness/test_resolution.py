@@ -6,7 +6,7 @@ from kit.plants import NEEDS_BULLET
 from servobench.controllers.controller import ControllerEntry, Delays
 from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import controller_names, engine_of, find_controller, offering
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import Settings, read_settings
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
@@ -101,6 +101,18 @@ def sensor_of(mismatch="moderate", varied=(), robot="ur5", **sections):
 def test_a_setting_of_the_user_is_kept_beside_a_profile_also_where_it_is_the_default():
     assert sensor_of("lab").latency > 0.0
     assert sensor_of("lab", kinematic={"sensing": {"latency": 0.0}}).latency == 0.0
+
+
+def test_a_file_that_repeats_defaults_changes_no_world(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text("[kinematic]\nlag = 0.08\n[kinematic.sensing]\nlatency = 0.0\noutliers = 0.0\njitter = 0.02\n")
+    settings = read_settings(path, [])
+    plant = resolve(RunRequest("kinematic", "constant", "random", "lab+outliers=5%", 3), settings).plant
+    assert (plant.sensing.latency, plant.sensing.outliers, plant.lag) == (0.095, 0.05, 0.08)
+    with pytest.raises(ConfigurationError, match="kinematic.sensing.jitter is set, and the mismatch jitter=50ms"):
+        resolve(RunRequest("kinematic", "constant", "random", "jitter=50ms", 3), settings)
+    given = read_settings(path, ["kinematic.sensing.latency=0"])
+    assert resolve(RunRequest("kinematic", "constant", "random", "lab", 3), given).plant.sensing.latency == 0.0
 
 
 @pytest.mark.parametrize("period", [0.005, 0.01, 0.1])

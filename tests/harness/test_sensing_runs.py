@@ -16,6 +16,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
+from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.request import RunRequest, find_sensing
 from servobench.harness.run.resolution import resolve
@@ -234,6 +235,8 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     word = f"{file}:hand"
     row = run_experiment(request(word), Settings({})).row
     assert (row["outcome"], row["sensing"]) == ("settled", word)
+    own, usual = (resolve(request(each), Settings({})) for each in (word, "position"))
+    assert side_by_side_key(own) is None is not side_by_side_key(usual)
     assert describe_sensing(word) == {"name": word, "features": ["r", "y", "z"], "unit": "m", "cameras": 1}
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")

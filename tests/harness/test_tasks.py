@@ -97,6 +97,9 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
         (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at each .*, got .*nan"),
         (("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
          r"its .* 3 finite features .*got shape \(12, 2\)"),
+        (("self.duration / 2)", "self.duration - 0.01)"), ".*begins at 0.99 s, after the last .* at 0.95 s"),
+        (("self.duration / 2)", "self.duration / 2, 'point')"), "kind must be one of .*, got 'point'"),
+        (("self.radius * times", "np.random.random() * times"), "its scenario differs from one call to the next"),
     ],
 )  # fmt: skip
 def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, change, words):

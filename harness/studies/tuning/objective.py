@@ -174,7 +174,7 @@ class Trial:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
         sections = Sections(
-            resolve_sections(requests, given := Settings(TASKS)) | {self.controller: self.config}, given
+            resolve_sections(requests, given := Settings(TASKS)) | {self.controller: self.config}, given, {}
         )
         return [select(request, sections) for request in requests]
 
