@@ -104,7 +104,7 @@ RANGES: Final[Mapping[str, Tuned]] = _marked(Tuned)
 
 
 class _Fixed(dict[str, Any]):
-    """A dictionary that all share, and nobody changes."""
+    """A dictionary that cannot be changed."""
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise TypeError("servobench.EQUIPPED is shared; change a copy, {**servobench.EQUIPPED, 'posture': False}")

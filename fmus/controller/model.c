@@ -1,14 +1,12 @@
 #include "model.h"
 #include "controller.h"
 
-#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* How far from a sampling instant the importer's time may be: a share of the period, and rounding of the time itself. */
+/* How far from a sampling instant the importer's time may be, beside rounding [1 of the period]. */
 #define SAMPLE_SHARE 1e-6
-#define ROUNDING (8.0 * DBL_EPSILON)
 /* In one step. */
 #define MAX_SAMPLES 1e6
 
@@ -34,7 +32,7 @@ const char *model_set(Model *model, size_t index, double value, int starting)
     return NULL;
 }
 
-/* When the next sample is due. Each sample begins a period anew, so that a sum of many steps need not be a multiple. */
+/* When the next sample is due: a period after the one before, so that rounding of the importer's time does not add up. */
 static double due(const Model *model) { return model->begun ? model->due : model->time; }
 
 static double tolerance(double time) { return SAMPLE_SHARE * PERIOD + ROUNDING * fabs(time); }

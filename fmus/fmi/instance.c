@@ -1,13 +1,11 @@
 #include "instance.h"
 
-#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* How far the importer's time may be from the model's own: a share of the step, and rounding of the time itself. */
+/* How far the importer's time may be from the model's own, beside rounding: a share of the step. */
 #define STEP_SHARE 1e-6
-#define ROUNDING (8.0 * DBL_EPSILON)
 /* How far a solver's last point may be behind the stop time [s]. */
 #define STOP_SLACK 1e-9
 

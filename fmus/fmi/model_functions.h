@@ -4,9 +4,14 @@
 #ifndef MODEL_FUNCTIONS_H
 #define MODEL_FUNCTIONS_H
 
+#include <float.h>
+
 #ifdef __GNUC__ /* The standard prescribes parameters that a model need not use. */
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #endif
+
+/* How far two times may be apart by rounding alone [1 of the time]. */
+#define ROUNDING (8.0 * DBL_EPSILON)
 
 /* Start values, time 0. */
 void model_reset(Model *model, int exchange);

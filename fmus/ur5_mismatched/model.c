@@ -122,10 +122,10 @@ void model_start(Model *model)
     model->stale = STALE_ALL;
 }
 
-/* A tool that became flexible or rigid is where a rigid one is, and moves as it does; whether states changed. */
+/* Gives a tool that became flexible no deflection and the velocity of a rigid one; returns whether states changed. */
 static int match_tool(Model *model)
 {
-    double motion[6] = {0.0}; /* of a rigid one: its velocity comes last, and is 0 in place of a state */
+    double motion[6] = {0.0}; /* place and velocity of a rigid tool; zeros for one that became rigid */
     if (model->flexible == is_flexible(model)) return 0;
     model->flexible = !model->flexible;
     if (model->flexible) evaluate(arm_motion, model, NULL, motion, NULL);

@@ -300,7 +300,7 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
 
 
 def _in_one_way(name: str, values: Sequence[Any]) -> tuple[Value, ...]:
-    """Return values that are all numbers or all texts, so that a column has one type; 0 has any unit."""
+    """Return values that are all numbers or all texts, so that their column has one type; 0 takes the others' unit."""
     texts = [each for each in values if isinstance(each, str)]
     unit = next((parts[1] for parts in map(split_quantity, texts) if parts), "")
     found = tuple(f"0{unit}" if texts and unit and each == 0 else each for each in values)
@@ -310,7 +310,7 @@ def _in_one_way(name: str, values: Sequence[Any]) -> tuple[Value, ...]:
 
 
 def _size(value: Value) -> object:
-    """Return a value, a quantity in an own unit of its own, by which 2s and 2000ms are equal."""
+    """Return a value for comparison: a quantity with a unit in its base unit, so that 2s and 2000ms are equal."""
     parts = split_quantity(value) if isinstance(value, str) else None
     own = next((own for own, units in UNITS.items() if parts and parts[1] and parts[1] in units), "")
     return (own, round(in_own_unit(*parts, own), 12)) if parts and own else value

@@ -151,10 +151,11 @@ def select(request: RunRequest, sections: Sections) -> ResolvedRun:
     run, robot = sections.with_changes("run", request.varied_in("run")), find_robot(request.robot)
     frames = sections.frames(request.plant, robot, run.period)
     drawn = () if robot.twin is None else _drawn_times(robot.twin, flatten(sections[request.plant]), request.seed)
-    varied = {key: f"plant.{key} is varied" for key, _ in plant}
-    given = {key: f"{request.plant}.{key} is set" for key in sections.given.get(request.plant, ()) if key in of_sensor}
-    if of_sensor and (both := [text for key, text in (given | varied).items() if key in of_sensor]):
-        raise ConfigurationError(f"{both[0]}, and the mismatch {request.mismatch} sets it, too; leave one out")
+    if both := [key for key, _ in plant if key in of_sensor]:
+        raise ConfigurationError(f"plant.{both[0]} is varied, and the mismatch {request.mismatch} sets it, too")
+    if both := sorted(of_sensor.keys() & sections.given.get(request.plant, frozenset())):
+        word = f"{request.plant}.{both[0]} is set"
+        raise ConfigurationError(f"{word}, and the mismatch {request.mismatch} sets it, too; leave one out")
     return ResolvedRun(
         request,
         run,

@@ -369,7 +369,7 @@ def _balanced(link: str, given: FloatArray) -> FloatArray:
     moments, axes = np.linalg.eigh(inertia)
     came = f"principal moments {', '.join(f'{moment:.3g}' for moment in moments)} kg m²"
     if not moments[0] > 0.0:
-        raise ValueError(f"link {link!r}: inertia must be positive definite, got {came}; all zeros have it estimated")
+        raise ValueError(f"link {link!r}: inertia must be positive definite, got {came}; for an estimate write zeros")
     excess = (1.0 + INERTIA_MARGIN) * moments[2] - moments[0] - moments[1]
     if excess <= 0.0:
         return inertia
