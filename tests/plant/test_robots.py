@@ -268,7 +268,7 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
         ),
         (
             HEAVY.replace('ixy="0"', 'ixy="0.02"'),
-            ": link 'link_1': inertia must be positive definite, got principal moments -0.01, 0.01, 0.03 kg m²; for an estimate",
+            ": link 'link_1': inertia must be positive definite, got principal moments -0.01, 0.01, 0.03 kg m²; for an",
         ),
         (HEAVY.replace('<mass value="2', '<mass value="-2'), ": link 'link_1': mass must be above 0, got -2.0"),
         (TWO_TREES, ".*both foot and link_4 are without a parent: a joint is missing or turned"),
