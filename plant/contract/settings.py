@@ -248,11 +248,12 @@ class Check:
 
     type: TypeAdapter[Any]
     usual: Usual
+    bare: bool = False  # whether its numbers are written without units, as in a URDF
 
     @classmethod
-    def of(cls, hint: Any) -> Self:  # noqa: ANN401 - any annotation
+    def of(cls, hint: Any, *, bare: bool = False) -> Self:  # noqa: ANN401 - any annotation
         """Return the check of an annotation, which may have a `Usual`."""
-        return cls(TypeAdapter(hint, config=STRICT), _usual(hint) or Usual(math.inf))
+        return cls(TypeAdapter(hint, config=STRICT), _usual(hint) or Usual(math.inf), bare)
 
 
 @cache
@@ -306,10 +307,10 @@ def read_value(name: str, given: object, check: Check, unit: Callable[[], str]) 
     try:
         value = check.type.validate_python(_in_own_unit(name, written, unit))
     except ValidationError as error:
-        raise ValueError(describe(error, name, written, unit())) from None
+        raise ValueError(describe(error, name, written, unit(), bare=check.bare)) from None
     least, most = check.usual.least, check.usual.size
     for number in [each for each in _numbers_in(value) if abs(each) > most or 0.0 < abs(each) < least][:1]:
-        meant = likely_meant(number, unit(), lambda other: least <= abs(other) <= most)
+        meant = likely_meant(number, unit(), lambda other: least <= abs(other) <= most, bare=check.bare)
         bound = f"at most {most:g}" if abs(number) > most else f"at least {least:g}"
         remark(f"{name} is {number:g}, and usually {f'{bound} {unit()}'.removesuffix(' 1')}{meant}")
     return value
@@ -353,13 +354,16 @@ def _numbers_in(value: object) -> Iterator[float]:
         yield value
 
 
-def likely_meant(number: float, unit: str, fits: Callable[[float], bool]) -> str:
+def likely_meant(number: float, unit: str, fits: Callable[[float], bool], *, bare: bool = False) -> str:
     """Return the remedy for a plain number that may have been meant in another unit, such as millimetres."""
-    meant = [text for text, value in alternatives(number, unit) if fits(value)]
-    return f"; if {' or '.join(meant)} is meant, write the unit, too" if meant else ""
+    meant = {text: f"{value:.6g}" for text, value in alternatives(number, unit) if fits(value)}
+    wanted = f"{' or '.join(meant.values())}, as units cannot be written here" if bare else "the unit, too"
+    return f"; if {' or '.join(meant)} is meant, write {wanted}" if meant else ""
 
 
-def describe(error: ValidationError, name: str = "", written: object = None, unit: str = "") -> str:
+def describe(
+    error: ValidationError, name: str = "", written: object = None, unit: str = "", *, bare: bool = False
+) -> str:
     """Return the first complaint of pydantic as one line: field, wanted and given value.
 
     Args:
@@ -367,6 +371,7 @@ def describe(error: ValidationError, name: str = "", written: object = None, uni
         name: of the checked object, in front of the field.
         written: the value as the user wrote it; numbers may be texts with a unit.
         unit: own unit of the number.
+        bare: whether units cannot be written.
     """
     first = error.errors(include_url=False)[0]
     for place in first["loc"]:
@@ -380,7 +385,7 @@ def describe(error: ValidationError, name: str = "", written: object = None, uni
         key, word, within = _BOUNDS[kind]
         if isinstance(written, str) and (parts := split_quantity(written)) and parts[1]:
             return f"{name} must be {word} {in_unit(context[key], parts[1], unit):g}{parts[1]}, got {written}"
-        meant = likely_meant(came, unit, lambda other: within(other, context[key]))
+        meant = likely_meant(came, unit, lambda other: within(other, context[key]), bare=bare)
         return f"{name} must be {word} {context[key]:g}, got {came!r}{meant}"
     if kind == "literal_error":
         words = context["expected"].replace("'", "").replace(" or ", ", ")

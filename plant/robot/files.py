@@ -71,10 +71,11 @@ Lengths = tuple[Annotated[Number, Ge(-20.0), Le(20.0), Usual(5.0)], ...]
 Twists = tuple[Annotated[Number, Ge(-6.3), Le(6.3)], ...]
 Limits = tuple[Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * pi)], ...]
 Mass = Annotated[Positive, Usual(500.0)]
-LENGTHS: Final = Check.of(Lengths)
-LIMITS: Final = Check.of(tuple[Annotated[Number, Usual(4.0 * pi)], ...])
-SPEEDS: Final = Check.of(tuple[JointSpeed, ...])
-MASS: Final = Check.of(Mass)
+# Checks of a URDF.
+LENGTHS: Final = Check.of(Lengths, bare=True)
+LIMITS: Final = Check.of(tuple[Annotated[Number, Usual(4.0 * pi)], ...], bare=True)
+SPEEDS: Final = Check.of(tuple[JointSpeed, ...], bare=True)
+MASS: Final = Check.of(Mass, bare=True)
 
 
 @settings
@@ -243,12 +244,13 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
         raise ValueError("it has no chain of at least three turning joints")
     chain, pose = [], np.eye(4)
     for joint in way:
-        if joint.mimic is not None:
-            raise ValueError(
-                f"joint {joint.name!r} on the way to {tip!r} turns with another (mimic), which is not modelled"
-            )
-        if joint.type not in (*TURNING, "fixed"):
-            raise ValueError(f"joint {joint.name!r} on the way to {tip!r} is of type {joint.type}; name another link")
+        if not _modelled(joint):
+            kind = f"is of type {joint.type}" if joint.mimic is None else "turns with another (mimic)"
+            other = _flange({name: way for name, way in ways.items() if all(map(_modelled, way))})
+            remedy = 'write type="fixed" if it can stay at rest'
+            if sum(map(_turns, ways[other])) >= 3:
+                remedy = f"name another link, such as #{other}"
+            raise ValueError(f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}")
         pose = pose @ _pose(joint.origin)
         read_value(f"joint {joint.name!r}: origin", tuple(pose[:3, 3].tolist()), LENGTHS, lambda: "m")
         if _turns(joint):
@@ -262,6 +264,10 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
 
 def _turns(joint: Any) -> bool:  # noqa: ANN401
     return joint.type in TURNING and joint.mimic is None
+
+
+def _modelled(joint: Any) -> bool:  # noqa: ANN401
+    return _turns(joint) or joint.type == "fixed"
 
 
 def _way(link: str, above: dict[str, Any]) -> list[Any]:
@@ -323,9 +329,12 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]: 
     own = [inertials[link.joint.child] for link in chain]
     efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]
     torque = np.array(efforts) if all(isfinite(effort) and effort > 0.0 for effort in efforts) else None
-    if any(inertial is None or not inertial.mass or not np.any(inertial.inertia) for inertial in own):
+    given = [inertial is not None and inertial.mass and np.any(inertial.inertia) for inertial in own]
+    if not all(given):
         further = "" if torque is not None else ", torque limits"
-        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}"
+        lacking = ", ".join(link.joint.child for link, known in zip(chain, given, strict=True) if not known)
+        cause = f" (no mass or inertia of {lacking})" if any(given) else ""
+        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}{cause}"
     mass, centre, inertia = (np.array(each) for each in zip(*(_body(tree, chain, link) for link in chain), strict=True))
     links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
     return links, "" if torque is not None else "estimated: torque limits"

@@ -270,8 +270,13 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     fit = [each for each in found if each is not None]
     if not fit:
         look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+        shift = arm.translation[0]
+        moved = [np.vstack([kept * shift, arm.translation[1:]]) for kept in ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))]
         if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
             look = "its joint limits, which forbid all of them"
+        elif any(_at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None for each in moved):
+            place = ", ".join(f"{each:g}" for each in shift)
+            look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
         wanted = "in which its ball is over the table, in view of the camera and free of contact"
         raise ValueError(f"the arm has no posture {wanted}; look at {look}")
     return max(fit, key=lambda each: each[0])[1]

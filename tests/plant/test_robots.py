@@ -236,7 +236,11 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
             'iyy="0.04"',
             "'link_1': no body has the principal moments 0.01, 0.01, 0.04 kg m², one above the",
         ),
-        ('<mass value="2', '<mass value="2000', "link 'link_1': mass is 2000, and usually at most 500 kg; if 2000g"),
+        (
+            '<mass value="2',
+            '<mass value="2000',
+            "link 'link_1': mass is 2000, and usually at most 500 kg; if 2000g is meant, write 2, as",
+        ),
     ]
     assert_remarks(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, cases)
 
@@ -264,7 +268,16 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
         ),
         (
             HEAVY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="joint_1"/>'),
-            r".*joint 'joint_2' on the way to '.*' turns with another \(mimic\)",
+            r".*joint 'joint_2' on the way to '.*' turns with another \(mimic\), which .*; write type=.fixed. if",
+        ),
+        (
+            HEAVY.replace('"fixed"', '"prismatic"'),
+            ".*joint 'bridge' on .* is of type prismatic.*; write type=.fixed. if",
+        ),
+        (HEAVY.replace("0 0 0.3", "0 0 300"), ": joint 'joint_1': origin.2 .* 300.0; if 300mm is meant, write 0.3, as"),
+        (
+            HEAVY.replace("0 0 0.3", "0 3 0.3"),
+            r": the arm has no posture .* at \(0, 3, 0.3\) m; .* an arm at \(0, 0, 0\)",
         ),
         (
             HEAVY.replace('ixy="0"', 'ixy="0.02"'),
@@ -325,6 +338,8 @@ def test_a_link_has_the_mass_of_all_that_hangs_on_it(tmp_path):
     np.testing.assert_allclose(links.mass, [2.0, 4.0, 2.0, 6.0])  # a bridge; a hand with a finger
     np.testing.assert_allclose(np.linalg.eigvalsh(links.inertia[0]), [0.01] * 3)
     np.testing.assert_allclose(np.linalg.eigvalsh(links.inertia[1]), [0.02, 0.06, 0.06])  # 0.1 m on both sides
+    massless = robot_of(tmp_path, "massless.urdf", HEAVY.replace(f'"link_3">{INERTIAL}', '"link_3">'))
+    assert "estimated: masses, inertia (no mass or inertia of link_3)" in massless.note
 
 
 @pytest.mark.slow
@@ -344,6 +359,8 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
     np.testing.assert_allclose(ros.arm.frames(q)[-1], read.arm.frames(q)[-1], atol=1e-12)
     with pytest.raises(ValueError, match="has no link 'hnd'"):
         find_robot(f"{path}#hnd")
+    with pytest.raises(ValueError, match="'finger_joint' on .* type prismatic.*; name another link, such as #hand"):
+        find_robot(f"{path}#finger")
     with pytest.raises(ValueError, match="no chain of at least three turning joints"):
         find_robot(f"{path}#link_1")
 
