@@ -142,38 +142,19 @@ class SerialArm:
         return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
 
 
-def arm_from_dh(a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...]) -> SerialArm:
-    """Return the arm of a standard DH table, without a ball.
-
-    Args:
-        a: (n,), m, link lengths.
-        d: (n,), m, link offsets.
-        alpha: (n,), rad, link twists.
-        joint_names: n names.
-
-    Returns:
-        The arm with gear ratios of 1, no joint offsets and its ball in the flange's origin.
-
-    Raises:
-        ValueError: a column of the wrong length.
-    """
-    n = len(joint_names)
-    translation, rpy = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
-    translation[1:, 0], translation[1:, 2] = as_vector("a", a, n), as_vector("d", d, n)
-    rpy[1:, 0] = as_vector("alpha", alpha, n)
-    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.zeros(3))
-
-
-def arm_from_modified_dh(
-    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...]
+def arm_from_dh(
+    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...], *, modified: bool = False
 ) -> SerialArm:
-    """Return the arm of a DH table by the modified convention, T_i = Rx(α_i) Tx(a_i) Rz(θ_i) Tz(d_i), without a ball.
+    """Return the arm of a DH table, without a ball.
+
+    T_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i) by the standard convention, Rx(α_i) Tx(a_i) Rz(θ_i) Tz(d_i) by the modified.
 
     Args:
-        a: (n,) or (n+1,), m; the last one of n+1 leads to the flange.
-        d: the same, m.
-        alpha: the same, rad.
+        a: (n,), m, link lengths; by the modified convention also (n+1,), of which the last one leads to the flange.
+        d: the same, m, link offsets.
+        alpha: the same, rad, link twists.
         joint_names: n names.
+        modified: whether the table is by the modified convention.
 
     Returns:
         The arm with gear ratios of 1, no joint offsets and its ball in the flange's origin.
@@ -182,13 +163,14 @@ def arm_from_modified_dh(
         ValueError: a column of the wrong length.
     """
     n = len(joint_names)
-    size = n + 1 if np.shape(a) == (n + 1,) else n
-    columns = [as_vector(name, value, size) for name, value in (("a", a), ("d", d), ("alpha", alpha))]
-    a_, d_, alpha_ = (np.pad(column, (0, n + 1 - size)) for column in columns)
-    translation = np.stack([a_, -d_ * np.sin(alpha_), d_ * np.cos(alpha_)], axis=-1)
+    size = n + 1 if modified and np.shape(a) == (n + 1,) else n
+    missing = (0, n + 1 - size) if modified else (1, 0)  # rows before and after those of the table
+    columns = ("a", a), ("d", d), ("alpha", alpha)
+    a_, d_, alpha_ = (np.pad(as_vector(name, value, size), missing) for name, value in columns)
+    y, z = (-d_ * np.sin(alpha_), d_ * np.cos(alpha_)) if modified else (np.zeros(n + 1), d_)
     rpy = np.zeros((n + 1, 3))
     rpy[:, 0] = alpha_
-    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.zeros(3))
+    return SerialArm(joint_names, np.stack([a_, y, z], axis=-1), rpy, np.zeros(n), np.ones(n), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

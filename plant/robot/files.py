@@ -43,7 +43,7 @@ from servobench.plant.contract.settings import (
     remark,
     settings,
 )
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh, rpy_from_rotation
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, rpy_from_rotation
 from servobench.plant.robot.makers import MAX_DEVIATION, nearest_title, read_calibration, universal_robot
 from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
 from servobench.plant.robot.workspace import find_workspace, with_ball
@@ -146,8 +146,7 @@ def _arm_of(table: DhTable) -> SerialArm:
     names = table.joint_names or tuple(f"joint_{i}" for i in range(1, n + 1))
     if len(names) != n:
         raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
-    read = arm_from_dh if table.convention == "standard" else arm_from_modified_dh
-    arm = read(table.a, table.d, table.alpha, names)
+    arm = arm_from_dh(table.a, table.d, table.alpha, names, modified=table.convention == "modified")
     return replace(arm, joint_offset=as_vector("theta", table.theta, n)) if table.theta else arm
 
 

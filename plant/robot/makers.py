@@ -21,7 +21,7 @@ import numpy.typing as npt
 from servobench.plant.contract.checks import as_vector
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
 from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, length_scale, with_ball
 
@@ -90,7 +90,7 @@ def _ur5(row: UniversalRobot, limits: JointLimits) -> Robot:
 def panda() -> Robot:
     """Return Franka's Panda, the arm with seven joints."""
     facts, joints = ur5.ARMS["panda"], tuple(f"joint_{i}" for i in range(1, 8))
-    arm = with_ball(arm_from_modified_dh(facts["a"], facts["d"], facts["alpha"], joints))
+    arm = with_ball(arm_from_dh(facts["a"], facts["d"], facts["alpha"], joints, modified=True))
     limits = JointLimits(*(np.array(facts[name]) for name in ("lower", "upper", "speed")))
     inertia = np.array([[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in facts["inertia"]])
     radius, aside = np.array(facts["radius"]), np.zeros(7)

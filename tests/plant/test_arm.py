@@ -12,13 +12,7 @@ from servobench.fmus.sources import core_functions
 from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
-from servobench.plant.robot.arm import (
-    SerialArm,
-    arm_from_dh,
-    arm_from_modified_dh,
-    rotation_from_rpy,
-    rpy_from_rotation,
-)
+from servobench.plant.robot.arm import SerialArm, arm_from_dh, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel, rotation_matrix
 from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
 from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, TOOL, ur5_arm
@@ -193,7 +187,7 @@ def test_the_modified_convention_turns_about_the_axis_behind_a_link(rows):
     """A product of Craig's transforms, Rx(α) Tx(a) Rz(θ) Tz(d); a fourth row leads to the flange."""
     rng = np.random.default_rng(5)
     a, d, alpha = rng.uniform(-1.0, 1.0, (3, rows))
-    arm, angles = arm_from_modified_dh(a, d, alpha, ("a", "b", "c")), rng.uniform(-3.0, 3.0, 3)
+    arm, angles = arm_from_dh(a, d, alpha, ("a", "b", "c"), modified=True), rng.uniform(-3.0, 3.0, 3)
     pose = np.eye(4)
     for a_i, d_i, alpha_i, angle in zip(a, d, alpha, [*angles, 0.0], strict=False):
         along, up = np.eye(4), np.eye(4)
@@ -201,4 +195,4 @@ def test_the_modified_convention_turns_about_the_axis_behind_a_link(rows):
         pose = pose @ elementary("x", alpha_i) @ along @ elementary("z", angle) @ up
     np.testing.assert_allclose(arm.ball_position(angles), pose[:3, 3], atol=1e-12)
     with pytest.raises(ValueError, match="d must have shape"):
-        arm_from_modified_dh(a, d[:2], alpha, ("a", "b", "c"))
+        arm_from_dh(a, d[:2], alpha, ("a", "b", "c"), modified=True)
