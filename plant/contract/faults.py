@@ -25,47 +25,38 @@ class RunFault(RuntimeError):
 
     status: ClassVar[str] = "fault"
 
+    def __init_subclass__(cls, status: str | None = None) -> None:
+        """Take the word of the table of runs; a class without one has that of its base, or sets `status` itself."""
+        if status is not None:
+            cls.status = status
 
-class PlantDiverged(RunFault):
+
+class PlantDiverged(RunFault, status="plant_diverged"):
     """The plant's state is no longer finite."""
 
-    status: ClassVar[str] = "plant_diverged"
 
-
-class Collision(RunFault):
+class Collision(RunFault, status="collision"):
     """The arm touched itself or a body of the room."""
 
-    status: ClassVar[str] = "collision"
 
-
-class FeatureLost(RunFault):
+class FeatureLost(RunFault, status="feature_lost"):
     """The feature was not measured for too many periods in a row."""
 
-    status: ClassVar[str] = "feature_lost"
 
-
-class FmuError(RunFault):
+class FmuError(RunFault, status="fmu_error"):
     """An FMU reported a failure or returned a value that is not finite."""
 
-    status: ClassVar[str] = "fmu_error"
 
-
-class ControllerDiverged(RunFault):
+class ControllerDiverged(RunFault, status="controller_diverged"):
     """A controller returned a command that is not finite."""
 
-    status: ClassVar[str] = "controller_diverged"
 
-
-class FilterDiverged(RunFault):
+class FilterDiverged(RunFault, status="filter_diverged"):
     """A covariance lost symmetry, positive definiteness or finiteness."""
 
-    status: ClassVar[str] = "filter_diverged"
 
-
-class SolverFailed(RunFault):
+class SolverFailed(RunFault, status="solver_failed"):
     """An optimiser returned no usable answer and no fallback was configured."""
-
-    status: ClassVar[str] = "solver_failed"
 
 
 class ConfigurationError(ValueError):
