@@ -28,21 +28,9 @@ MASS, CENTRE_OF_MASS, INERTIA = _FACTS["mass"], _FACTS["centre"], _FACTS["inerti
 MAX_TORQUE = _FACTS["torque"]
 TUBE_RADIUS, SIDE_STEP = _FACTS["tube_radius"], _FACTS["side_step"]
 
-# The ball stands off the flange so that the wrist does not hide it from above.
-TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
-
-# The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
-HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
-
-MOVES: Final[Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]] = _FACTS["moves"]
-# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m; its Jacobian is nearly singular.
-STRETCHED = (0.132772, -3.141593, 0.0, -0.483504, 1.421076, -0.000417)  # rad
-
-SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
-
-# The box of joint positions in which networks are trained on the nominal model, rad.
-TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
-TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
+TOOL, SHOULDER, MOVES = _FACTS["tool"], _FACTS["shoulder"], _FACTS["moves"]
+HOME, STRETCHED = _FACTS["home"], _FACTS["stretched"]
+TRAINING_LOWER, TRAINING_UPPER = _FACTS["training_lower"], _FACTS["training_upper"]
 
 
 def ur5_arm() -> SerialArm:
