@@ -4,7 +4,7 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import branch, plus_diagonal, transposed
+from servobench.plant.contract.lanes import branch, plus_diagonal
 
 MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
 MIN_SINGULAR_RATIO = 1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
@@ -41,10 +41,10 @@ def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
     """
     if damping == 0.0:
         return np.asarray(np.linalg.pinv(J))
-    square = J @ transposed(J)
+    square = J @ J.mT
     ordinary = square.trace(axis1=-2, axis2=-1) < MAX_DAMPED_RATIO * damping**2
     inverse = branch(ordinary, _solve_normal_equations, J, square, damping)
-    return transposed(branch(~ordinary, _decompose, inverse, J, damping))
+    return branch(~ordinary, _decompose, inverse, J, damping).mT
 
 
 def _solve_normal_equations(J: FloatArray, square: FloatArray, damping: float) -> FloatArray:
@@ -63,4 +63,4 @@ def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArra
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
     basis = rows * (singular > MIN_SINGULAR_RATIO * singular[..., :1])[..., None]
     flat = weights.reshape(*weights.shape[:-2], -1)
-    return np.asarray(transposed(basis) @ (basis @ flat)).reshape(weights.shape)
+    return np.asarray(basis.mT @ (basis @ flat)).reshape(weights.shape)

@@ -18,7 +18,7 @@ from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ControllerDiverged
-from servobench.plant.contract.lanes import branch, pick, transposed
+from servobench.plant.contract.lanes import branch, pick
 from servobench.plant.contract.settings import Delay, Number, Positive, Usual, settings
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
@@ -199,7 +199,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             raise ControllerDiverged(
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
-        return np.ascontiguousarray(transposed(np.linalg.solve(Q, Y)))
+        return np.ascontiguousarray(np.linalg.solve(Q, Y).mT)
 
 
 def _with_entry(rows: FloatArray, index: IntArray, row: FloatArray) -> FloatArray:

@@ -38,7 +38,7 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import GatedEstimator, Motion
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import FilterDiverged
-from servobench.plant.contract.lanes import outer, plus_diagonal, transposed
+from servobench.plant.contract.lanes import outer, plus_diagonal
 from servobench.plant.contract.settings import Deviation, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -92,7 +92,7 @@ def joseph(P: FloatArray, PH: FloatArray, K: FloatArray, joint_step: FloatArray,
 
 def symmetric(P: FloatArray) -> FloatArray:
     """Return (P + Pᵀ)/2, (..., n, n): rounding leaves a covariance a little asymmetric."""
-    return np.asarray((P + transposed(P)) / 2)
+    return np.asarray((P + P.mT) / 2)
 
 
 def kalman_update(
@@ -113,9 +113,9 @@ def kalman_update(
     *lead, m, n = J.shape
     x, H = J.reshape(*lead, m * n), np.einsum("ij,...k->...ijk", np.eye(m), joint_step).reshape(*lead, m, m * n)
     HP, R = H @ P, r[..., None, None] * np.eye(m)
-    K = transposed(np.linalg.solve(HP @ transposed(H) + R, HP))
+    K = np.linalg.solve(HP @ H.mT + R, HP).mT
     A = np.eye(m * n) - K @ H
-    P = A @ P @ transposed(A) + K @ R @ transposed(K)
+    P = A @ P @ A.mT + K @ R @ K.mT
     return (x + np.matvec(K, feature_step - np.matvec(H, x))).reshape(J.shape), symmetric(P)
 
 
@@ -246,17 +246,17 @@ def unscented_update(
     """
     *lead, m, n = J.shape
     size, weights = m * n, sigma_weights(m * n, config.alpha, config.beta, config.kappa)
-    reach = weights.reach * transposed(cholesky_of(P))
+    reach = weights.reach * cholesky_of(P).mT
     offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
     points = J.reshape(*lead, 1, size) + offsets
     Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])  # a point is m rows of J
     z = np.vecmat(weights.mean, Z)
     deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
-    S = transposed(deviations) @ weighted + r[..., None, None] * np.eye(m)
-    C = transposed(offsets) @ weighted
-    K = transposed(np.linalg.solve(S, transposed(C)))
-    P = P - K @ transposed(C)  # K S = C
+    S = deviations.mT @ weighted + r[..., None, None] * np.eye(m)
+    C = offsets.mT @ weighted
+    K = np.linalg.solve(S, C.mT).mT
+    P = P - K @ C.mT  # K S = C
     return J + np.matvec(K, feature_step - z).reshape(J.shape), symmetric(P)
 
 

@@ -32,7 +32,7 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import RandomWalk, cholesky_of
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, outer, transposed, where
+from servobench.plant.contract.lanes import norm, outer, where
 from servobench.plant.contract.settings import NonNegative, settings
 
 BISQUARE: Final = 4.685  # [1] c_b: 95 % efficiency under normal noise
@@ -123,7 +123,7 @@ class RobustEstimator(Estimator[RobustState]):
         keep = np.exp(-duration / MEMORY)[..., None]
         rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTION_WEIGHT)
         lost = rejected > LOST_SHARE
-        P = where(lost, _restarted_at_frame(P, noise), (P + transposed(P)) / 2)
+        P = where(lost, _restarted_at_frame(P, noise), (P + P.mT) / 2)
         excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(axis=-1)
         scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
         deviation, none = innovation * (1.0 - gain[..., 0]), np.zeros_like(innovation)
@@ -140,7 +140,7 @@ class RobustEstimator(Estimator[RobustState]):
         walk = np.where(norm(joint_step) >= config.min_joint_step, config.walk**2 * duration, 0.0)
         Q = np.broadcast_to(walk[..., None, None], (*predicted.shape, n + 1)).copy()
         Q[..., 0] = (config.motion_error * norm(predicted)[..., None]) ** 2
-        return F @ P @ transposed(F) + Q[..., None] * np.eye(n + 1)
+        return F @ P @ F.mT + Q[..., None] * np.eye(n + 1)
 
     def diagnostics(self, state: RobustState) -> Diagnostics:
         """Return the scale of the noise, the share of rejected frames and the mean deviation of J's entries, m/rad."""

@@ -26,7 +26,7 @@ from servobench.controllers.periods import check_preview, in_periods, sampled
 from servobench.controllers.stages.finish import largest_excess
 from servobench.controllers.stages.prediction import pushed
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, transposed
+from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray, Observation
 
@@ -103,7 +103,7 @@ def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
     pull = ahead.errors @ jacobian
     outer = pull[..., :, None] * ahead.xi[..., None, :]
     *lead, horizon, n, p = outer.shape
-    return np.asarray(transposed(outer.reshape(*lead, horizon, n * p)) @ ahead.h).reshape(*lead, n, p, -1)
+    return np.asarray(outer.reshape(*lead, horizon, n * p).mT @ ahead.h).reshape(*lead, n, p, -1)
 
 
 def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float) -> FloatArray:

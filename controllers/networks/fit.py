@@ -76,11 +76,6 @@ def pool_size(count: int, placement: Placement) -> int:
     return count * CLUSTERING_POOL if placement == "kmeans" else count
 
 
-def joint_samples(unit: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return joint positions (..., n), rad, in the box from unit points (..., n)."""
-    return np.asarray(lower + (upper - lower) * unit)
-
-
 @dataclass(frozen=True, eq=False)
 class ControllerSamples:
     """Samples to which the controller network is fitted."""
@@ -115,7 +110,7 @@ def controller_samples(
         jacobian: of the nominal model, vectorised.
     """
     plan, (lower, upper), (n, m) = config.controller, config.region(spec.n), (spec.n, spec.m)
-    q = joint_samples(unit[:, :n], lower, upper)
+    q = lower + (upper - lower) * unit[:, :n]
     direction, magnitude = 2.0 * unit[:, n : n + m] - 1.0, unit[:, n + m : n + m + 1]
     error = plan.error_range * magnitude * direction
     steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (spec.joint_velocity_limit * plan.step)
@@ -199,7 +194,7 @@ def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, 
         ValueError: as `train`.
     """
     lower, upper = config.region(spec.n)
-    sample = joint_samples(unit_points(DIGEST_POINTS, spec.n, np.random.default_rng(0)), lower, upper)
+    sample = lower + (upper - lower) * unit_points(DIGEST_POINTS, spec.n, np.random.default_rng(0))
     J = _checked(nominal_jacobian, sample, spec)
     content = {
         "config": asdict(config),
@@ -220,8 +215,8 @@ def _train_jacobian(
     placement = plan.placement
     unit = unit_points(plan.samples, spec.n, rng, placement)
     pool = unit_points(pool_size(plan.centres, placement), spec.n, rng, placement)
-    centres = joint_samples(choose_centres(pool, plan.centres, rng, placement), lower, upper)
-    q = joint_samples(unit, lower, upper)
+    centres = lower + (upper - lower) * choose_centres(pool, plan.centres, rng, placement)
+    q = lower + (upper - lower) * unit
     J = _checked(nominal_jacobian, q, spec)
     held = max(1, round(plan.samples * config.held_out))
     spread = float(np.linalg.norm(upper - lower)) / 2.0

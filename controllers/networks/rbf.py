@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import transposed
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
@@ -147,7 +146,7 @@ class JacobianNetwork:
         """
         lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
         # the products of each layer with each column, of which most are not wanted
-        every = theta.reshape(*lead, count * layers, units) @ transposed(rows.reshape(*rows.shape[:-3], -1, units))
+        every = theta.reshape(*lead, count * layers, units) @ rows.reshape(*rows.shape[:-3], -1, units).mT
         return every.reshape(*lead, count, -1).take(self._places, axis=-1)
 
     def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
@@ -162,7 +161,7 @@ class JacobianNetwork:
         of_layers = joint_steps[..., None, :] * self._members
         factors = errors[..., None, :, None] * of_layers[..., None, :]
         flat = theta.reshape(*lead, count * layers, units)
-        gradient = transposed(factors.reshape(*lead, count * layers, -1)) @ flat
+        gradient = factors.reshape(*lead, count * layers, -1).mT @ flat
         return np.asarray(gradient.reshape(*lead, self.m, self.n, units))
 
     def jacobian(self, q: FloatArray, rows: FloatArray | None = None) -> FloatArray:

@@ -42,7 +42,7 @@ from servobench.controllers.controller import Delays
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, transposed
+from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import Observation
 
 WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
@@ -128,7 +128,7 @@ class JointResponse(NamedTuple):
 
 def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) -> JointResponse:
     weight = 1.0 / state.window  # windows overlap
-    A = state.A + weight * (steps @ transposed(steps))
+    A = state.A + weight * (steps @ steps.mT)
     b = state.b + weight * np.matvec(steps, joint_step)
     most = MAX_EXCITATION * state.window**2 * state.period
     kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from servobench.harness.run.log import Steps, flat
 from servobench.harness.run.references import TaskKind
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, transposed
+from servobench.plant.contract.lanes import norm
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
@@ -150,7 +150,7 @@ def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
 
 def path_length(points: FloatArray) -> FloatArray:
     """Return the length, (...), of the path through `points`, (..., m, k) [their unit]."""
-    steps = np.ascontiguousarray(transposed(np.diff(points, axis=-1)))
+    steps = np.ascontiguousarray(np.diff(points, axis=-1).mT)
     return np.asarray(norm(steps).sum(axis=-1))
 
 

@@ -102,19 +102,6 @@ def repeat(
     return tree
 
 
-def lane_by_lane(function: Callable[..., Any], signature: str, *arguments: Any) -> Any:  # noqa: ANN401
-    """Return the results of a function for single runs, which is called for one lane after the other.
-
-    Args:
-        function: for single runs.
-        signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
-        arguments: of the function, all with the same leading axes, if any; the first one is an array.
-    """
-    if np.ndim(arguments[0]) == signature.partition(")")[0].count(",") + 1:
-        return function(*arguments)
-    return np.vectorize(function, signature=signature)(*arguments)
-
-
 def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
     """Return the entries at one index for each lane, along the first axis after the leading ones.
 
@@ -163,11 +150,6 @@ def _identity(size: int) -> FloatArray:
     identity = np.eye(size)
     identity.flags.writeable = False
     return identity
-
-
-def transposed(A: npt.NDArray[Any]) -> FloatArray:
-    """Return Aᵀ, (..., n, m), for A (..., m, n)."""
-    return A.mT
 
 
 def one_thread() -> AbstractContextManager[object]:

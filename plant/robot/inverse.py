@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, plus_diagonal, transposed
+from servobench.plant.contract.lanes import norm, plus_diagonal
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
 
@@ -108,7 +108,7 @@ def _step(
     downhill = np.vecmat(error, J)
     free = ~((q <= lower) & (downhill < 0.0) | (q >= upper) & (downhill > 0.0))
     J = J * free[..., None, :]
-    weighted = np.linalg.solve(plus_diagonal(J @ transposed(J), damping[..., None]), error[..., None])[..., 0]
+    weighted = np.linalg.solve(plus_diagonal(J @ J.mT, damping[..., None]), error[..., None])[..., 0]
     return np.asarray(np.clip(q + np.vecmat(weighted, J), lower, upper))
 
 

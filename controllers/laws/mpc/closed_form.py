@@ -25,7 +25,6 @@ import numpy as np
 
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import transposed
 
 _SERIES_BELOW = 0.5  # below, the series of 18 terms is exact to rounding; above, the closed form
 _SERIES_TERMS = 18
@@ -184,9 +183,9 @@ class UnlimitedPlan:
             targets: (..., moves, m); for a constant step m times blocks².
         """
         weighted = J / self._move_weight
-        s, V = np.linalg.eigh(weighted @ transposed(J))
+        s, V = np.linalg.eigh(weighted @ J.mT)
         along = self._forth @ targets @ V / (1.0 + self._eigenvalues * s[..., None, :])
-        both = self._back @ (along @ (transposed(V) @ weighted))
+        both = self._back @ (along @ (V.mT @ weighted))
         moves = len(self._forth)
         return both[..., :moves, :], both[..., moves:, :]
 

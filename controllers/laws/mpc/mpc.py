@@ -12,7 +12,7 @@ from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Sol
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.finish import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, as_vector
-from servobench.plant.contract.lanes import branch, lane_by_lane, norm, transposed, where
+from servobench.plant.contract.lanes import branch, norm, where
 from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import BoolArray, Observation
 
@@ -249,9 +249,9 @@ class MpcLaw(Law[MpcState]):
         shape, moves, J, targets = self._shape, state.plan.moves, state.J, state.targets
         effort = 0.5 * (self._Q * moves**2).sum(axis=(-2, -1))
         if shape.constant_gain is not None:
-            step = moves @ transposed(J)
+            step = moves @ J.mT
             return np.asarray(effort + (0.5 * shape.constant_gain * step**2 - targets * step).sum(axis=(-2, -1)))
-        miss = targets - np.cumsum(moves, axis=-2) @ transposed(J)
+        miss = targets - np.cumsum(moves, axis=-2) @ J.mT
         return np.asarray(effort + 0.5 * (shape.weights[:, None] * miss**2).sum(axis=(-2, -1)))
 
     def _program_targets(self, error: FloatArray, ahead: FloatArray) -> FloatArray:
@@ -266,8 +266,9 @@ class MpcLaw(Law[MpcState]):
     def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:
         """Return the best plan within the limits."""
         signature = "(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()"
-        parts = lane_by_lane(self._solve, signature, plan.moves, J, targets, *bounds)
-        return Plan(*map(np.asarray, parts))
+        # numpy.vectorize takes one lane after the other
+        solve = self._solve if plan.moves.ndim == 2 else np.vectorize(self._solve, signature=signature)
+        return Plan(*map(np.asarray, solve(plan.moves, J, targets, *bounds)))
 
     def _solve(
         self, moves: FloatArray, J: FloatArray, targets: FloatArray, *bounds: FloatArray

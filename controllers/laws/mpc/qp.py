@@ -28,7 +28,6 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import SolverFailed
-from servobench.plant.contract.lanes import transposed
 from servobench.plant.contract.signals import BoolArray, PlantSpec
 
 Solver: TypeAlias = Literal["daqp", "qpoases"]
@@ -170,7 +169,7 @@ def exceeds(shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, t
         beyond = (travel > bounds.travel_upper[..., None, :]) | (travel < bounds.travel_lower[..., None, :])
         broken = broken | _any(beyond, axis=(-2, -1))
     if len(shape.view_rows):
-        moved = travel @ transposed(shape.view_rows @ J)
+        moved = travel @ (shape.view_rows @ J).mT
         broken = broken | _any(moved < bounds.view_margin[..., None, :], axis=(-2, -1))
     return np.asarray(broken)
 
