@@ -63,9 +63,9 @@ def test_a_command_within_the_limits_is_sent_as_it_is(limit):
 
 
 def test_a_command_beyond_the_limits_is_scaled_cut_or_taken_over_by_joints_with_room():
-    wanted = np.array([3.0, -0.5, 0.2, -1.5, 0.6]) * LIMIT
+    wanted = np.array([1.9, -0.5, 0.2, -1.5, 0.6]) * LIMIT
     scaled, cut, shared = (finish(wanted, limit=limit) for limit in ("scale", "clip", "redistribute"))
-    np.testing.assert_allclose(scaled[0], wanted / 3.0)
+    np.testing.assert_allclose(scaled[0], wanted / 1.9)
     np.testing.assert_array_equal(cut[0], np.clip(wanted, -LIMIT, LIMIT))
     way = A @ wanted
     np.testing.assert_array_less(np.abs(shared[0]), LIMIT * (1.0 + 1e-12))

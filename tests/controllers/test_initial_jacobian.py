@@ -92,11 +92,15 @@ def test_a_probing_move_turns_away_from_a_joint_limit():
 
 
 def test_a_joint_that_does_not_move_is_a_named_fault():
-    provider = initial_jacobian(InitialConfig("probe"), RobotKnowledge(spec(), 0))
-    observation, done = Observation(0.0, np.zeros(2), np.zeros(1)), False
-    state = provider.start(observation)
+    provider, q, done = (
+        initial_jacobian(InitialConfig("probe"), RobotKnowledge(plant_spec(3, 1), 0)),
+        np.zeros(3),
+        False,
+    )
+    state = provider.start(Observation(0.0, q, np.zeros(1)))
     while not done:
-        state, _, done = provider.step(state, observation)
+        state, u, done = provider.step(state, Observation(0.0, q, np.zeros(1)))
+        q = q + 0.05 * u * [1.0, 1.0, 0.0]
     with pytest.raises(ControllerDiverged, match="moved the joints too little"):
         provider.jacobian(state)
 
@@ -143,7 +147,7 @@ def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_tak
             for given in ((), ((1.0,),), ((1.0, 2.0), (3.0,)))
         ),
         ({"source": "probe", "probe_step": 0.2}, 1.0, r"probe_step must be at most 0\.1 rad"),
-        ({"source": "probe"}, 0.02, "probe_step must be at most half the joint range"),
+        ({"source": "probe"}, 0.029, "probe_step must be at most half the joint range"),
     ],
 )
 def test_a_source_that_does_not_fit_the_robot_is_refused(settings, reach, message):

@@ -149,7 +149,7 @@ def test_lost_frames_do_not_mislead_jacobian_and_delay():
     assert made.error(TURN @ NETWORK.jacobian(q[-1])) < 0.1
 
 
-@pytest.mark.parametrize("false", [[12], [12, 13], [12, 17, 18, 19, 26]])
+@pytest.mark.parametrize("false", [[12], [12, 13, 14, 15], [12, 17, 18, 19, 26]])
 def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
     q = path(1.6)
     y, valid = late_features(q, np.eye(M), 0), np.full(len(q), True)

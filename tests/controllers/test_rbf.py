@@ -68,6 +68,9 @@ def test_epsilon_grows_with_the_square_of_the_noise_that_is_known():
     # Twice the usual millimetre: α₂ = 0.5 / (4 · 0.01 + 0.01) = 10
     estimator.update(replace(motion([0.1], [0.5]), noise=np.asarray(0.002)))
     assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(10.0)
+    # Two motions of two joints: α₂ = 0.5 / (0.01 + 0.12 + 0.18 + 0.01 · 8 / 4)
+    sizes, steps = np.array([[1.0, 3.0], [2.0, 2.0]]), np.array([[0.1, 0.2], [0.3, 0.0]])
+    assert window_step(sizes, steps, np.int_(2), 0.5, 0.01) == pytest.approx(0.5 / 0.33)
 
 
 @pytest.mark.parametrize("k2", [0.1, 1.0, 1.9])

@@ -106,6 +106,10 @@ def test_a_rejected_frame_counts_by_its_time():
     run = Learning(RobustEstimator(RobustConfig()), np.ones((M, N)))
     run.update(motion(np.zeros(N), np.full(M, 9.0)))
     np.testing.assert_allclose(run.state.rejected, 1.0 - np.exp(-0.05 / MEMORY), rtol=1e-12)
+    for rejected in range(2, 26):  # 0.7 of the last second takes 1.2 s
+        assert run.state.deviation.min() > 8.0, rejected
+        run.update(motion(np.zeros(N), np.zeros(M)))
+    assert not np.any([run.state.deviation, run.state.rejected])
 
 
 def test_the_scale_follows_noise_that_is_larger_than_configured():

@@ -121,7 +121,7 @@ def test_a_maker_s_limits_hold_beside_those_that_are_set():
     assert (limits.speed == 1.0).all()
     np.testing.assert_array_equal(limits.upper, [2.0, 1.7628, 2.0, -0.0698, 2.0, 2.0, 2.0])
     with pytest.raises(ValueError, match="joint_lower must be below joint_upper"):
-        JointLimits(np.zeros(1), np.zeros(1), np.ones(1))
+        JointLimits(np.zeros(2), np.array([0.0, 1.0]), np.ones(2))
     with pytest.raises(ValueError, match="joint_velocity_limit must be positive"):
         JointLimits(np.zeros(2), np.ones(2), np.array([1.0, 0.0]))
 
