@@ -53,7 +53,23 @@ NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entr
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
 NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> another, and its values that leave it idle
     "aids.latency": ("aids.delay", ("ignored", "identified")),
+    **dict.fromkeys(
+        ("aids.longest_delay", "aids.delay_margin", "aids.score_memory"), ("aids.delay", ("ignored", "given"))
+    ),
+    **dict.fromkeys(("aids.command_delay", "aids.lag"), ("aids.response", ("ignored", "identified"))),
+    "aids.response_length": ("aids.response", ("ignored", "given")),
+    "aids.posture_gain": ("aids.posture", (False,)),
+    "estimator.reset_norm": ("estimator.reset", (False,)),
+    **dict.fromkeys(("estimator.alpha", "estimator.beta", "estimator.kappa"), ("estimator.form", ("split",))),
+    "image_window": ("image", (False,)),
     "initial.given": ("initial.source", ("nominal", "probe")),
+    **dict.fromkeys(
+        (f"initial.{each}" for each in ("probe_step", "probe_time", "settle_time", "average_time")),
+        ("initial.source", ("nominal", "given")),
+    ),
+    "law.derivative_filter": ("law.derivative_gain", (0.0,)),
+    "mechanics.ripple_order": ("mechanics.ripple", (0.0,)),
+    "mechanics.tool_damping": ("mechanics.tool_frequency", (0.0,)),
     "sensing.noise_offset": ("sensing.noise", ("white", "stable", "uniform")),
     "sensing.outlier_size": ("sensing.outliers", (0.0,)),
 }

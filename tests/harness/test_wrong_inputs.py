@@ -389,6 +389,8 @@ def test_a_task_as_it_comes_is_not_remarked_on(caplog, task, sensing):
         ("kinematic.sensing.outlier_size=0.1", (), "has no effect while kinematic.sensing.outliers is 0.0"),
         ("kinematic.sensing.outlier_size=0.1", ("--mismatch", "outliers=20%"), ""),
         ("constant.initial.given=[[1.0]]", (), "has no effect while constant.initial.source is nominal"),
+        ("constant.initial.probe_step=0.1", (), "has no effect while constant.initial.source is nominal"),
+        ("constant.aids.lag=0.1", (), "has no effect while constant.aids.response is ignored"),
     ],
 )  # fmt: skip
 def test_a_setting_that_waits_for_another_is_remarked_on(
