@@ -31,7 +31,8 @@ def check_preview(wanted: float, rows: int, period: float, settings: str) -> Non
         ValueError: it is too short.
     """
     if rows < in_periods(wanted, period):
-        raise ValueError(f"preview must reach {settings} = {wanted:g} s, got {rows} rows of {period:g} s")
+        came = f"got {rows} rows of {period:g} s; lengthen run.preview_time"
+        raise ValueError(f"preview must reach {settings} = {wanted:g} s, {came}")
 
 
 def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:

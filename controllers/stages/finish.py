@@ -145,9 +145,10 @@ class Finish:
         Raises:
             ValueError: a stage that the law brings itself, or a feedforward without a preview.
         """
-        for stage, asked in (("preview", aids.feedforward), ("limit", aids.limit != "scale")):
-            if asked and stage in owns:
-                raise ValueError(f"aids: {law} brings its own {stage}; leave that aid off")
+        asked = ("preview", "feedforward", aids.feedforward), ("limit", "limit", aids.limit != "scale")
+        for stage, aid, on in asked:
+            if on and stage in owns:
+                raise ValueError(f"aids.{aid}: {law} brings its own {stage}; leave this aid out")
         if aids.feedforward and knowledge.preview < 1:
             raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
         spec = knowledge.spec

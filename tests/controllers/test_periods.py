@@ -39,5 +39,7 @@ def test_the_rounding_of_many_periods_is_a_share_of_them_and_that_of_one_a_share
 def test_a_preview_that_does_not_reach_far_enough_is_refused():
     check_preview(0.15, 3, 0.05, "what")
     check_preview(0.05, 3, 0.02, "what")
-    with pytest.raises(ValueError, match=r"preview must reach what = 0.05 s, got 2 rows of 0.02 s"):
+    with pytest.raises(
+        ValueError, match=r"preview must reach what = 0.05 s, got 2 rows of 0.02 s; lengthen run.preview_time"
+    ):
         check_preview(0.05, 2, 0.02, "what")

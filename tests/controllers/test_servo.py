@@ -191,8 +191,8 @@ PREVIEWING = MpcLaw(MpcConfig(horizon_time=0.05, moves=1), KNOWLEDGE)
         (PREDICTIVE, {"delay": "identified"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
         (PREDICTIVE, {"response": "given"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
         (PREDICTIVE, {"filter": True}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
-        (PREVIEWING, {"feedforward": True}, "aids: MpcLaw brings its own preview; leave that aid off"),
-        (PREVIEWING, {"limit": "clip"}, "aids: MpcLaw brings its own limit; leave that aid off"),
+        (PREVIEWING, {"feedforward": True}, "aids.feedforward: MpcLaw brings its own preview; leave this aid out"),
+        (PREVIEWING, {"limit": "clip"}, "aids.limit: MpcLaw brings its own limit; leave this aid out"),
         (None, {"feedforward": True}, "preview must be at least 1 for feedforward, got 0"),
     ],
 )
