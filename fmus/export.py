@@ -47,6 +47,7 @@ class ExportOptions:
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))  # platforms to compile for
     mismatch: str = "none"  # text for the documentation that says how the model differs from the nominal one
     robot: Robot = field(default_factory=lambda: find_robot(UR5))  # by its maker's description
+    step: float = 0.05  # of the default experiment and the reference run [s]
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
@@ -140,6 +141,7 @@ def product(options: ExportOptions) -> Product:
             sections=arm_sections(layout),
             start=parameters_of(options.model, options.actuation),
             sources=c_files(options.fmi_version, CORE),
+            step=options.step,
         ),
         documentation=documentation(
             MODEL,
@@ -151,7 +153,7 @@ def product(options: ExportOptions) -> Product:
             feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
             mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
         ),
-        reference=reference_run(options.model, options.actuation).tables(layout),
+        reference=reference_run(options.model, options.actuation, options.robot, options.step).tables(layout),
     )
 
 

@@ -136,7 +136,7 @@ class Description:
     sections: tuple[Section, ...]  # of the model structure
     start: Mapping[str, FloatArray]  # start values of parameters and inputs, flat arrays by group; else zero
     sources: tuple[str, ...]  # C files to compile, in order
-    step: float = 0.05  # of the default experiment [s]
+    step: float  # of the default experiment [s]
     exchange: bool = True  # whether there is model exchange, with derivatives, beside co-simulation
 
 

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.fmus.variables import FEATURE, SEEN, Actuation, Layout
+from servobench.fmus.variables import BALL, FEATURE, SEEN, Actuation, Layout
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.kinematic import discretise_lag
+from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 from servobench.plant.robot.hand_eye import RobotModel
+from servobench.plant.robot.robot import Robot
 
-STEP = 0.05  # [s]
 STEPS = 200
 INPUT_FILE = "extra/servobench/reference_input.csv"
 OUTPUT_FILE = "extra/servobench/reference_output.csv"
@@ -34,39 +35,23 @@ class ReferenceRun:
         return table(self.time, self.inputs, layout), table(self.time, self.outputs, layout)
 
 
-def reference_run(model: RobotModel, actuation: Actuation) -> ReferenceRun:
-    """Return the reference run of `model`; some of its commands exceed the speed limit."""
-    n = model.arm.n
-    stops = actuation.stops(n)
-    limit = stops.speed
+def reference_run(model: RobotModel, actuation: Actuation, robot: Robot, step: float) -> ReferenceRun:
+    """Return steps [s] of `model`, a `robot`, as the kinematic plant; some commands exceed the speed limit."""
+    lag, mechanics = float(actuation.lag), actuation.mechanics
+    config = KinematicConfig(actuation.max_speed, actuation.joint_range, lag, mechanics=mechanics)
+    world = KinematicWorld(config, PlantSetup(model, actuation.home, step, robot))
+    limit, n = world.spec.command.upper, model.arm.n
     wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
-    lags = np.broadcast_to(actuation.lag, n).tolist()
-    A, B = (np.stack(parts, axis=-1) for parts in zip(*(discretise_lag(lag, STEP) for lag in lags), strict=True))
-    positions, velocities = np.empty((STEPS + 1, n)), np.empty((STEPS + 1, n))
-    q, v = np.array(actuation.home, dtype=np.float64), np.zeros(n)
-    for k in range(STEPS + 1):
-        positions[k], velocities[k] = q, v
-        u = np.clip(wanted[k], -limit, limit)
-        free = q + A[0, 1] * v + B[0] * u
-        q = np.clip(free, stops.lower, stops.upper)
-        v = np.where(q == free, A[1, 1] * v + B[1] * u, 0.0)
-    resolution = np.broadcast_to(actuation.encoder_resolution, n)
-    steps = np.where(resolution > 0.0, resolution, 1.0)
-    outputs = {
-        "joint_position": positions,
-        "joint_velocity": velocities,
-        **_features(model, positions),
-        "encoder_position": np.where(resolution > 0.0, np.round(positions / steps) * steps, positions),
-    }
-    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, {COMMAND: wanted}, outputs)
-
-
-def _features(model: RobotModel, positions: FloatArray) -> dict[str, FloatArray]:
-    """Return the features at joint positions (k, n), (k, size) by name."""
-    if not isinstance(model, SetupModel):
-        return {"ball_position": model.feature(positions), SEEN: np.ones((len(positions), 3))}
-    feature, _, seen = model.observe(positions)
-    return {FEATURE: feature, SEEN: seen.astype(np.float64)}
+    rows = []
+    for command in np.clip(wanted, -limit, limit):
+        state, feature, visible = world.save(), world.see(), world.visible()
+        seen = np.ones_like(feature) if visible is None else visible.astype(np.float64)
+        rows.append((state.q, state.v, feature, seen, state.q))
+        world.advance(command)
+    measured = FEATURE if isinstance(model, SetupModel) else BALL
+    names = ("joint_position", "joint_velocity", measured, SEEN, "encoder_position")
+    outputs = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
+    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * step, {COMMAND: wanted}, outputs)
 
 
 def read_table(text: str) -> tuple[list[str], FloatArray]:

@@ -10,13 +10,12 @@ from servobench.fmus.compiler import Platform
 from servobench.fmus.controller_export import COMMAND, FEATURE, POSITION, SEEN
 from servobench.fmus.model_description import UNITS, exporter, xml_bytes
 from servobench.fmus.product import Product, write_archive
-from servobench.fmus.variables import INPUT
+from servobench.fmus.variables import BALL, INPUT
 
 SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 STRUCTURE: Final = "SystemStructure.ssd"
 PLANT, CONTROLLER = "plant", "controller"
-BALL: Final = "ball_position"  # name of the feature of a plant without a set-up of cameras
 
 
 def write_loop(path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float) -> Path:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
+from servobench.fmus.variables import BALL, FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.registry import Sensing
@@ -89,7 +89,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         file=path,
         inputs=("joint_velocity_command",),
         joints=("encoder_position" if resolution > 0.0 else "joint_position",),
-        features=("ball_position",) if view is None else (FEATURE,),
+        features=(BALL,) if view is None else (FEATURE,),
         seen=() if view is None else (SEEN,),
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",

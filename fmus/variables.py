@@ -27,6 +27,7 @@ DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "outpu
 
 RIGID: Final = MechanicsConfig()  # without play, ripple and flexibility
 FEATURE: Final = "feature"
+BALL: Final = "ball_position"  # name of the feature without a set-up of cameras
 SEEN: Final = "seen"
 
 
@@ -170,7 +171,7 @@ BALL_PARAMETERS: Final = (
 def _ball_outputs(n: int) -> tuple[Group, ...]:
     """Return the outputs that the generated core computes of the ball in 3-D."""
     return (
-        Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
+        Group(BALL, (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group(SEEN, (3,), OUTPUT, "1", "1: the camera sees the ball wherever it is."),
         Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
     )

@@ -147,8 +147,10 @@ def _run(experiment: Experiment) -> ReferenceRun:
     )
 
 
-def arm_product(request: RunRequest, words: str, fmi: int = 2, **actuation: Any) -> Product:  # noqa: ANN401
+def arm_product(request: RunRequest, words: str, fmi: int = 2, step: float = 0.05, **actuation: Any) -> Product:  # noqa: ANN401
     """Return the true arm of a run ready for export, with `words` on its mismatch and fields of its `Actuation`.
+
+    Its default experiment has steps of `step` [s].
 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
@@ -159,7 +161,7 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, **actuation: Any)
         raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
     robot, (true, *_) = find_robot(request.robot), draw_robot(request)
     usual = replace(default_actuation(robot), **actuation)
-    return product(ExportOptions(fmi, true, usual, mismatch=words, robot=robot))
+    return product(ExportOptions(fmi, true, usual, mismatch=words, robot=robot, step=step))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
@@ -181,6 +183,6 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
     words, own = f"{request.mismatch}, seed {request.seed}", {"lag": config.lag, "max_speed": config.max_joint_speed}
     own |= {"joint_range": config.joint_range, "mechanics": config.mechanics, "home": scenario.start}
-    plant = arm_product(request, words, **own)
+    plant = arm_product(request, words, step=run.period, **own)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
     return plant, controller, scenario.duration

@@ -43,6 +43,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.ur5 import JOINT_NAMES
 
 VERSIONS = [2, 3]
@@ -53,6 +54,12 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
     assert validate_by_fmpy(str(cached_fmu(version))) == []
     found = validate_fmu(cached_fmu(version))
     assert found.problems == ()
+    assert found.deviation < 1e-12
+
+
+def test_the_reference_run_agrees_with_play_ripple_and_a_flexible_tool(tmp_path):
+    own = replace(default_actuation(), mechanics=MechanicsConfig(backlash=0.02, ripple=0.02, tool_frequency=30.0))
+    found = validate_fmu(export_fmu(tmp_path / "arm.fmu", ExportOptions(actuation=own, step=0.02)))
     assert found.deviation < 1e-12
 
 
@@ -264,6 +271,6 @@ def test_a_compiler_that_refuses_the_sources_is_quoted(tmp_path):
 
 
 def test_the_reference_run_meets_the_speed_limit():
-    run_ = reference_run(nominal_ur5(), default_actuation())
+    run_ = reference_run(nominal_ur5(), default_actuation(), find_robot("ur5"), 0.05)
     assert (np.abs(run_.inputs["joint_velocity_command"]) > 1.0).any()
     assert np.abs(run_.outputs["joint_velocity"]).max() <= 1.0

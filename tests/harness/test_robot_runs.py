@@ -134,7 +134,9 @@ def test_worlds_without_gears_and_tool_are_refused_in_one_line():
 def test_the_arm_of_a_loop_has_the_settings_of_its_plant_or_refuses_them():
     request = RunRequest("kinematic", "rbf_pid:published", "target", "none", 2)
     own = {"lag": 0.2, "max_joint_speed": 0.5, "mechanics": {"tool_frequency": 12.0}}
-    start = loop_products(request, Settings({"kinematic": own}))[0].description.start
+    plant, controller, _ = loop_products(request, Settings({"kinematic": own, "run": {"period": 0.02}}))
+    assert plant.description.step == controller.description.step == 0.02
+    start = plant.description.start
     assert [float(np.max(start[name])) for name in ("lag", "max_speed", "tool_frequency")] == [0.2, 0.5, 12.0]
     with pytest.raises(ConfigurationError, match="commanded a period later: leave kinematic.sensing.latency out"):
         loop_products(request, Settings({"kinematic": {"sensing": {"latency": 0.1}}}))
