@@ -29,7 +29,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_inputs, check_unit, read_mapping
+from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_roles, check_unit, read_mapping
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -104,7 +104,7 @@ class FmuController(Controller):
             if found[role] and came != size:
                 raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
         given = {role: found[role] for role in ("joints", "features", "seen", "reference")}
-        check_inputs(given, self._description)
+        check_roles({"outputs": found["outputs"], "jacobian": found["jacobian"], **given}, given, self._description)
         units = {"outputs": "rad/s", "joints": "rad", "features": feature_unit, "reference": feature_unit}
         for role, unit in units.items():
             check_unit(role, found[role], unit)

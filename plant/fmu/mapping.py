@@ -9,7 +9,7 @@
 The keys are the fields of `FmuMapping`, its sections the fields of their own classes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import MISSING, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar, cast
@@ -19,23 +19,16 @@ from annotated_types import MinLen
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import (
-    File,
-    Names,
-    Numbers,
-    Positive,
-    Usual,
-    Values,
-    nested,
-    override,
-    remark,
-    settings,
-)
+from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.contract.units import SPELLINGS, UNITS
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
 
 Roles = TypeVar("Roles")
+# Units of FMUs that are never another spelling of the wanted one.
+DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit not in {"", "%"}} | {
+    "m/s", "mm/s", "rad/s2", "deg/s2", "m/s2", "N", "N.m", "A", "V",
+}  # fmt: skip
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
 
 
@@ -168,32 +161,32 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
             f"{description.path.name} takes steps of multiples of {own:g} s only (fixedInternalStepSize), so period "
             f"must be one, got {step:g} s"
         )
-    inputs, features = description.select(mapping.inputs, "inputs"), description.select(mapping.features, "features")
-    check_inputs({"inputs": inputs}, description)
-    check_unit("inputs", inputs, "rad/s")
-    given = mapping.names.feature_unit
-    for variable in features:
-        if variable.unit != given and {variable.unit, given} <= UNITS["m"].keys():
-            raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {given}")
-    n, m = total_size(inputs), total_size(features)
+    n, m = (total_size(description.select(getattr(mapping, role), role)) for role in ("inputs", "features"))
     if not (n and m):
         raise ValueError(f"inputs and features must name at least one number each, got {n} and {m}")
-    if mapping.features == mapping.joints:
-        joints = ", ".join(mapping.joints)
-        remark(f"features of the mapping are its joints, {joints}; a camera measures other quantities")
-    truth = mapping.truth
-    for name, names, size in (
-        ("joints", mapping.joints, n),
-        ("seen", mapping.seen, m),
-        ("truth.features", truth.features, m),
-        ("truth.jacobian", truth.jacobian, n * m),
-        ("truth.states", truth.states, n),
-    ):
-        came = total_size(found := description.select(names, name))
-        if name in {"joints", "truth.states"}:
-            check_unit(name, found, "rad")
-        if names and came != size:
-            raise ValueError(f"{name} must name {size} numbers for {n} inputs and {m} features, got {came}")
+    truth, camera, unit = mapping.truth, mapping.camera or (), mapping.names.feature_unit
+    roles = (
+        ("inputs", mapping.inputs, n, "rad/s"),
+        ("joints", mapping.joints, n, "rad"),
+        ("features", mapping.features, m, unit),
+        ("seen", mapping.seen, m, "1"),
+        ("truth.features", truth.features, m, unit),
+        ("truth.jacobian", truth.jacobian, n * m, f"{unit}/rad"),
+        ("truth.states", truth.states, n, "rad"),
+        ("home", () if mapping.home is None else (mapping.home,), n, "rad"),
+        ("camera[1]", camera[:1], 3, "m"),
+        ("camera[2]", camera[1:], 3, "rad"),
+    )
+    found = {role: description.select(names, role) for role, names, *_ in roles}
+    again = ("truth.features", "truth.states")
+    check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
+    for variable in found["features"]:
+        if is_other_unit(variable.unit, unit):
+            raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {unit}")
+    for role, names, size, own_unit in roles:
+        check_unit(role, found[role], own_unit)
+        if names and (came := total_size(found[role])) != size:
+            raise ValueError(f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}")
     return PlantSpec.of_joints(
         _labels("joint", mapping.names.joints, n),
         _labels("feature", mapping.names.features, m),
@@ -205,34 +198,38 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     )
 
 
-def check_inputs(roles: Mapping[str, Iterable[Variable]], description: FmuDescription) -> None:
-    """Refuse variables by role that are no inputs, or that are named twice.
+def check_roles(roles: Mapping[str, Iterable[Variable]], inputs: Container[str], description: FmuDescription) -> None:
+    """Refuse variables by role that are named twice, or that are no inputs in the roles `inputs`.
 
     Raises:
         ValueError: names the variable.
     """
     taken: dict[str, str] = {}
     for role, variable in ((role, variable) for role, variables in roles.items() for variable in variables):
-        if variable.causality != "input":
+        if role in inputs and variable.causality != "input":
             raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
         if (other := taken.get(variable.name)) is not None:
             how = "twice" if other == role else f"as {other} does; each has its own"
-            raise ValueError(f"{description.path.name}: {role} names the input {variable.name!r} {how}")
+            raise ValueError(f"{description.path.name}: {role} names {variable.name!r} {how}")
         taken[variable.name] = role
 
 
+def is_other_unit(unit: str, own: str) -> bool:
+    """Return whether a unit that an FMU declares is known and not the own one."""
+    return unit.translate(SPELLINGS) != own and unit.translate(SPELLINGS) in DECLARED
+
+
 def check_unit(role: str, variables: Iterable[Variable], own: str) -> None:
-    """Refuse variables that the FMU declares in another unit of the same quantity.
+    """Refuse variables that the FMU declares in another unit.
 
     Raises:
         ValueError: names the variable and its unit.
     """
     for variable in variables:
-        unit = variable.unit.translate(SPELLINGS)
-        if unit != own and unit in UNITS.get(own, {}):
-            raise ValueError(
-                f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: convert it in the FMU"
-            )
+        if is_other_unit(variable.unit, own):
+            unit = variable.unit.translate(SPELLINGS)
+            remedy = "convert it in the FMU" if unit in UNITS.get(own, {}) else "name another variable"
+            raise ValueError(f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}")
 
 
 def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:

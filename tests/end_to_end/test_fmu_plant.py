@@ -172,7 +172,7 @@ def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, versi
         ({"inputs": ("pusch.slew", "push.luff")}, r"inputs names 'pusch.slew'.*did you mean 'push.slew'.*wheel.slew"),
         ({"inputs": ("place.slew", "place.luff")}, "causality output"),
         ({"joints": ("wheel.slew",)}, "joints must name 2 numbers for 2 inputs and 2 features, got 1"),
-        ({"truth": TruthMapping(jacobian=("place.slew",))}, "truth.jacobian must name 4 numbers"),
+        ({"truth": TruthMapping(jacobian=("arm.slew",))}, "truth.jacobian must name 4 numbers"),
         ({"home": "gear"}, "type Integer; wanted a real variable"),
         ({"parameters": {"arm.slew": np.array([1.0, 2.0])}}, "parameter 'arm.slew' must have 1 values, got 2"),
         ({"names": LogNames(("slew",))}, "names.joints must hold 2 names, got 1"),

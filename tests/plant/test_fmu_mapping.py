@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from servobench.plant.contract.settings import remark
 from servobench.plant.fmu.description import FmuDescription, Variable
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping, mapping_spec, read_mapping
 
@@ -87,44 +86,63 @@ def test_a_missing_mapping_is_told(tmp_path):
         read_mapping(FmuMapping, tmp_path / "missing.toml")
 
 
-@pytest.mark.parametrize(("told", "given", "fits"), [("m", "mm", False), ("mm", "m", False), ("m", "m", True),
-                                                     ("1", "px", True), ("", "mm", True)])  # fmt: skip
-def test_a_unit_of_length_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
-    variables = Variable("v", 0, 1, "input"), Variable("y", 1, 1, "output", unit=told)
-    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
-    mapping = FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), names=LogNames(feature_unit=given))
+def spec_of(folder, units=None, **roles):
+    """Return the spec of an FMU with an input, outputs and parameters, of the given units, by a mapping of roles."""
+    units = {"v": "rad/s", "q": "rad", "y": "", "q0": "rad", "at": "m", "turned": "rad"} | (units or {})
+    causes = dict.fromkeys(units, "output") | {"v": "input", "q0": "parameter"}
+    sizes = dict.fromkeys(units, 1) | {"at": 3, "turned": 3}
+    variables = [
+        Variable(name, i, sizes[name], causes[name], unit=unit) for i, (name, unit) in enumerate(units.items())
+    ]
+    described = FmuDescription(folder / "a.fmu", folder, 2, "a", "a", "", False, False, False, tuple(variables))
+    mapping = FmuMapping(folder / "a.fmu", **{"inputs": ("v",), "features": ("y",), "joints": ("q",)} | roles)
+    return mapping_spec(mapping, described, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("told", "given", "fits"),
+    [("m", "mm", False), ("mm", "m", False), ("m", "m", True), ("1", "px", True), ("", "mm", True), ("rad", "m", False),
+     ("m", "rad", False), ("m", "px", False)],
+)  # fmt: skip
+def test_a_unit_of_features_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
     if fits:
-        assert mapping_spec(mapping, described, 0.05).feature_unit == given
+        assert spec_of(tmp_path, {"y": told}, names=LogNames(feature_unit=given)).feature_unit == given
         return
     with pytest.raises(ValueError, match=f"names.feature_unit must be {told}, the unit of y, got {given}"):
-        mapping_spec(mapping, described, 0.05)
+        spec_of(tmp_path, {"y": told}, names=LogNames(feature_unit=given))
 
 
-@pytest.mark.parametrize(("role", "unit", "wanted"), [("v", "deg/s", "rad/s"), ("q", "°", "rad")])
-def test_degrees_of_the_fmu_are_refused(tmp_path, role, unit, wanted):
-    units = {"v": "rad/s", "q": "rad", "y": "m"} | {role: unit}
-    variables = (
-        Variable("v", 0, 1, "input", unit=units["v"]),
-        Variable("q", 1, 1, "output", unit=units["q"]),
-        Variable("y", 2, 1, "output", unit=units["y"]),
-    )
-    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
-    with pytest.raises(ValueError, match=f"names '{role}', whose unit is deg.*wanted {wanted}: convert it in the FMU"):
-        mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
+@pytest.mark.parametrize(
+    ("role", "unit", "message"),
+    [
+        ("v", "deg/s", "inputs names 'v', whose unit is deg/s; wanted rad/s: convert it in the FMU"),
+        ("q", "°", "joints names 'q', whose unit is deg; wanted rad: convert it in the FMU"),
+        ("v", "N.m", "inputs names 'v', whose unit is N.m; wanted rad/s: name another variable"),
+        ("q", "m", "joints names 'q', whose unit is m; wanted rad: name another variable"),
+        ("q0", "deg", "home names 'q0', whose unit is deg; wanted rad: convert"),
+        ("at", "mm", r"camera\[1\] names 'at', whose unit is mm; wanted m: convert"),
+        ("turned", "m", r"camera\[2\] names 'turned', whose unit is m; wanted rad: name another"),
+    ],
+)
+def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, message):
+    spec_of(tmp_path, home="q0", camera=("at", "turned"))
+    with pytest.raises(ValueError, match=message):
+        spec_of(tmp_path, {role: unit}, home="q0", camera=("at", "turned"))
 
 
-def test_an_input_that_is_named_twice_is_refused(tmp_path):
-    variables = Variable("v", 0, 1, "input"), Variable("y", 1, 1, "output")
-    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
-    with pytest.raises(ValueError, match="a.fmu: inputs names the input 'v' twice"):
-        mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v", "v"), ("y",)), described, 0.05)
-
-
-def test_features_that_are_the_joints_are_remarked_on(tmp_path, caplog):
-    remark.cache_clear()
-    variables = Variable("v", 0, 1, "input"), Variable("q", 1, 1, "output"), Variable("y", 2, 1, "output")
-    described = FmuDescription(tmp_path / "a.fmu", tmp_path, 2, "a", "a", "", False, False, False, variables)
-    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("y",), joints=("q",)), described, 0.05)
-    assert not caplog.text
-    mapping_spec(FmuMapping(tmp_path / "a.fmu", ("v",), ("q",), joints=("q",)), described, 0.05)
-    assert "features of the mapping are its joints, q;" in caplog.text
+@pytest.mark.parametrize(
+    ("roles", "message"),
+    [
+        ({"inputs": ("v", "v")}, "a.fmu: inputs names 'v' twice"),
+        ({"features": ("q",)}, "a.fmu: features names 'q' as joints does; each has its own"),
+        ({"features": ("v",)}, "a.fmu: features names 'v' as inputs does"),
+        ({"features": ("y", "y")}, "a.fmu: features names 'y' twice"),
+        ({"seen": ("y",)}, "a.fmu: seen names 'y' as features does"),
+        ({"camera": ("at", "y")}, r"a.fmu: camera\[2\] names 'y' as features does"),
+        ({"camera": ("q0", "turned")}, r"camera\[1\] must name 3 numbers"),
+        ({"inputs": ("q",), "joints": ()}, "inputs names 'q', which is of causality output"),
+    ],
+)
+def test_a_variable_in_two_roles_or_of_the_wrong_size_is_refused(tmp_path, roles, message):
+    with pytest.raises(ValueError, match=message):
+        spec_of(tmp_path, {"q0": ""}, **roles)
