@@ -63,8 +63,7 @@ class Product:
         texts |= {name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")}
         texts |= {name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8") for name in HEADERS[version_]}
         texts[f"{self.core}.c"] = self.source
-        layout = described.layout, described.start, self.constants
-        texts["layout.h"] = layout_header(*layout, described.model_identifier, PLACEHOLDER)
+        texts["layout.h"] = layout_header(described.layout, described.start, self.constants, PLACEHOLDER)
         return {f"sources/{name}": text for name, text in texts.items()}
 
     def descriptions(self, token: str) -> dict[str, bytes]:

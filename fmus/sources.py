@@ -32,6 +32,7 @@ from servobench.plant.cameras.symbolic import (
     valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.robot.mechanics import FREQUENCIES, MAX_PART
 
 # Generated functions do not use all of their parameters; none of them is exported by the library.
 HEAD = """/* Generated with CasADi's code generator; not meant to be edited. */
@@ -59,16 +60,13 @@ def generated_source(name: str, functions: Iterable[Any]) -> str:
         return HEAD.format(name=name) + (Path(folder) / f"{name}.c").read_text(encoding="utf-8")
 
 
-def layout_header(
-    layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], model_name: str, token: str
-) -> str:
+def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Mapping[str, float], token: str) -> str:
     """Return the C header with sizes, offsets, start values and minima.
 
     Args:
         layout: groups of the model.
         start: start values, flat arrays by group; zero where there are none.
         constants: further ones by name.
-        model_name: for log messages.
         token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
     """
     settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
@@ -78,7 +76,6 @@ def layout_header(
         "-HUGE_VAL" if each.minimum is None else each.minimum.hex() for each in settable for _ in range(each.size)
     ]
     macros = {
-        "MODEL_NAME": f'"{model_name}"',
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),
         "N_VALUES": layout.size,
@@ -106,14 +103,17 @@ def kinematics_source(layout: ArmLayout) -> str:
     return generated_source("kinematics", core_functions(layout))
 
 
-def arm_constants(layout: ArmLayout) -> dict[str, int]:
-    """Return the sizes and offsets that the model of an arm needs beside those of every layout."""
+def arm_constants(layout: ArmLayout) -> dict[str, float]:
+    """Return the sizes, offsets and limits that the model of an arm needs beside those of every layout."""
     first, *_ = layout.computed
     work = max(function.sz_w() for function in core_functions(layout))
     return {
         "N_JOINTS": layout.by_name["joint_position"].size,
         "N_WORK": max(work, 1),
         "OFFSET_FEATURE": layout.offsets[first.name],
+        "MAX_PART": MAX_PART,
+        "MIN_FREQUENCY": FREQUENCIES[0],
+        "MAX_FREQUENCY": FREQUENCIES[1],
     }
 
 

@@ -9,12 +9,9 @@
 #define MIN_LAG 1e-6
 /* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
 #define STOP_HYSTERESIS 1e-9
-/* Over which play is updated once, and the acceleration of a flexible tool changes linearly, at most [s]. */
-#define MAX_PART 0.005
 #define MAX_PARTS 1000.0 /* of a step; an importer may ask for one of any length */
-/* Of a flexible tool [rad/s]: the closed form loses its digits below, and overflows far above. */
-#define MIN_FREQUENCY 0.1
-#define MAX_FREQUENCY 1e6
+#define QUOTED(text) #text
+#define IN_WORDS(number) QUOTED(number)
 
 enum { STALE_FEATURE = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
@@ -138,7 +135,7 @@ static const char *check_ranges(const Model *model)
 {
     const double frequency = model->values[OFFSET_TOOL_FREQUENCY];
     if (frequency != 0.0 && !(frequency >= MIN_FREQUENCY && frequency <= MAX_FREQUENCY)) {
-        return "tool_frequency is neither 0 nor from 0.1 to 1e6 rad/s";
+        return "tool_frequency is neither 0 nor from " IN_WORDS(MIN_FREQUENCY) " to " IN_WORDS(MAX_FREQUENCY) " rad/s";
     }
     if (!(model->values[OFFSET_TOOL_DAMPING] < 1.0)) return "tool_damping is not below 1";
     for (size_t i = 0; i < N_JOINTS; i++) {

@@ -67,6 +67,9 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
     controller, spec, name = experiment.controller, experiment.plant.spec, f"controller {entry.name!r}"
     if not isinstance(controller, ServoController):
         raise ConfigurationError(f"{name} cannot be exported: it is not composed of an estimator and a law")
+    if not controller.servo.initial.immediate:
+        remedy = "set initial.source to nominal or given"
+        raise ConfigurationError(f"{name} cannot be exported while it probes its initial Jacobian: {remedy}")
     groups = controller_groups(spec.n, spec.m, 1 + experiment.run.preview_rows, spec.feature_unit)
     shapes: dict[str, tuple[tuple[int, ...], str]] = {"time": ((), "f")}
     shapes |= {each.name: (each.shape, "b" if each.name == SEEN else "f") for each in groups if each.role == INPUT}

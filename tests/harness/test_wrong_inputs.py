@@ -242,6 +242,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("shadow", "text.csv"), "text.csv does not say which controller to show it to; name one with --controller"),
     (("shadow", "columns.csv", "--controller", "constant"), "log columns.csv has no column time_s; it needs time_s"),
     (("shadow", "text.csv", "--controller", "constant", "--sensing", "pixl"), "did you mean 'pixel'?"),
+    (("fmu", "export", "--controller", "rbf_pid", "--set", "rbf_pid.initial.source=probe", "-o", "new.fmu"),
+     "controller 'rbf_pid' cannot be exported while it probes its initial Jacobian: set initial.source to nominal"),
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "controller 'ukf_mpc' has no exported form: it "
      "holds something that is no formula"),
     (("fmu", "export", "--controller", "mfac+rls", "--sensing", "plate", "-o", "new.fmu"), "plate, but perhaps with"),
