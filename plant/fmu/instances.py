@@ -10,10 +10,10 @@ import math
 import os
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -39,17 +39,13 @@ class Lane:
     read: RawCall  # reads joints and feature
     read_truth: RawCall  # reads the true feature and, where it is mapped, the Jacobian
 
-    def resting(self) -> Self:
-        """Return the lane with calls that do nothing, for an instance that has failed."""
-        return replace(self, write=_nothing, step=_nothing, read=_nothing, read_truth=_nothing)
-
 
 class Instances:
     """The lanes of an FMU.
 
     Attributes:
-        lanes: one for each run.
-        live: the same for the inner loop, where those that failed rest; empty after `close`.
+        lanes: one for each run; empty after `close`.
+        live: those of them that have not failed.
     """
 
     def __init__(self, fail: Callable[[int, FmuError], None]) -> None:
@@ -75,12 +71,12 @@ class Instances:
 
     def each(self, act: Callable[..., None], *results: Sequence[int]) -> None:
         """Call `act`, outside the inner loop, with each lane that has not failed and with its results."""
-        for i, (lane, *own) in enumerate(zip(self.live, *results, strict=True)):
-            if lane is self.lanes[i]:
+        for lane, *own in list(zip(self.live, *results, strict=True)):
+            if lane in self.live:
                 try:
                     act(lane, *own)
                 except FmuError as fault:
-                    self.drop(i, fault)
+                    self.drop(lane, fault)
 
     def check(self, verb: str, port: Port, statuses: Sequence[int]) -> None:
         """Check the statuses of calls that read or write a port."""
@@ -93,24 +89,25 @@ class Instances:
         if any(results):
             self.each(lambda lane, result: lane.instance.finish(result, time, step), results)
 
-    def drop(self, i: int, fault: FmuError) -> None:
+    def drop(self, lane: Lane, fault: FmuError) -> None:
         """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
-        for j in range(len(self.lanes)) if self.lanes[i].instance.library.condemned else (i,):
-            if self.live[j] is self.lanes[j]:
-                self._fail(j, fault)
-                self.live[j] = self.lanes[j].resting()
+        fatal = lane.instance.library.condemned
+        for each in [each for each in self.live if fatal or each is lane]:
+            self._fail(self.lanes.index(each), fault)
+            self.live.remove(each)
 
     def keep(self, chosen: Sequence[int]) -> None:
         """Close all other instances."""
         for i in set(range(len(self.lanes))).difference(chosen):
             self.lanes[i].instance.close()
-        self.lanes, self.live = [self.lanes[i] for i in chosen], [self.live[i] for i in chosen]
+        self.lanes = [self.lanes[i] for i in chosen]
+        self.live = [lane for lane in self.lanes if lane in self.live]
 
     def close(self) -> None:
         """Free all instances; calling it twice is allowed."""
-        self.live = []
         for lane in self.lanes:
             lane.instance.close()
+        self.lanes = self.live = []
 
 
 def open_instance(
@@ -129,10 +126,6 @@ def open_instance(
     """
     kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
     return kind(description, tolerance, debug_log)
-
-
-def _nothing() -> int:
-    return OK
 
 
 _Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)

@@ -187,7 +187,7 @@ class FmuWorld(World):
             FmuError: the FMU of a single run failed, or a result is not finite.
         """
         instances = self._instances
-        if not instances.live:
+        if not instances.lanes:
             raise FmuError("the plant has been closed")
         self._at_start = False
         self._command.values[self._rows] = joint_velocity
@@ -207,7 +207,8 @@ class FmuWorld(World):
         values = np.array(self._result.values[self._rows])
         if self.faults or not is_finite(values):
             for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
-                self._instances.drop(i, self._not_finite(values.reshape(-1, values.shape[-1])[i]))
+                fault = self._not_finite(values.reshape(-1, values.shape[-1])[i])
+                self._instances.drop(self._instances.lanes[i], fault)
             failed = list(self.faults)
             values[failed, self._split : self._split + self.spec.m] = self._feature[failed]
             if self._has_joints:
