@@ -14,9 +14,11 @@ from servobench.fmus.model_description import Description, arm_sections, exporte
 from servobench.fmus.product import Product, c_files, check_version, documentation, word
 from servobench.fmus.reference import reference_run
 from servobench.fmus.sources import arm_constants, kinematics_source
-from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
+from servobench.fmus.variables import ArmLayout, View, arm_groups, parameters_of
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import SETUPS, Sensing
 from servobench.plant.cameras.setups import SetupModel
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
@@ -26,14 +28,19 @@ MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
 PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
 SOURCES: Final = {".py", ".c", ".h", ".html", ".txt"}
+STEP: Final = 0.05  # [s] of the default experiment
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
 
-def default_actuation(robot: Robot | None = None) -> Actuation:
-    """Return the default lag and limits of the kinematic plant and the home of a robot; without one of the UR5."""
-    described = robot or find_robot(UR5)
-    home = described.workspace.home
-    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=home, limits=described.limits)
+def nominal_setup(robot: Robot | None = None, sensing: Sensing | None = None) -> PlantSetup:
+    """Return a robot, by default the UR5, without mismatch at home, by default with the sensing `position`.
+
+    Raises:
+        ValueError: the arm has too few joints for the sensing.
+    """
+    robot = robot or find_robot(UR5)
+    model = robot.nominal if sensing is None else sensing.nominal(robot)
+    return PlantSetup(model, robot.workspace.home, STEP, robot)
 
 
 @dataclass(frozen=True)
@@ -41,19 +48,27 @@ class ExportOptions:
     """Options of an export."""
 
     fmi_version: int = 2  # 2 or 3; each has co-simulation and model exchange
-    # arm and camera whose numbers become the start values
-    model: RobotModel = field(default_factory=lambda: find_robot(UR5).nominal)
-    actuation: Actuation = field(default_factory=default_actuation)  # lag, limits and home that become start values
+    # arm, cameras and home that become start values, and the step of default experiment and reference run
+    setup: PlantSetup = field(default_factory=nominal_setup)
+    config: KinematicConfig = field(default_factory=KinematicConfig)  # of lag, limits and mechanics
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))  # platforms to compile for
     mismatch: str = "none"  # text for the documentation that says how the model differs from the nominal one
-    robot: Robot = field(default_factory=lambda: find_robot(UR5))  # by its maker's description
-    step: float = 0.05  # of the default experiment and the reference run [s]
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
         check_version(self.fmi_version)
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
+
+    @property
+    def model(self) -> RobotModel:
+        """Arm and cameras."""
+        return self.setup.robot()[0]
+
+    @property
+    def robot(self) -> Robot:
+        """The robot by its maker's description."""
+        return self.setup.nominal or find_robot(UR5)
 
     @property
     def view(self) -> View | None:
@@ -90,16 +105,6 @@ class ExportOptions:
         )
 
 
-def nominal_options(fmi_version: int, robot: Robot, sensing: Sensing | None = None) -> ExportOptions:
-    """Return the options of an export of a robot without mismatch, by default with the sensing `position`.
-
-    Raises:
-        ValueError: the arm has too few joints for the sensing.
-    """
-    model = robot.nominal if sensing is None else sensing.nominal(robot)
-    return ExportOptions(fmi_version, model, default_actuation(robot), robot=robot)
-
-
 def export_fmu(path: Path, options: ExportOptions) -> Path:
     """Write the FMU to `path` atomically; see `Product.write`."""
     return product(options).write(path, options.platforms)
@@ -117,7 +122,7 @@ def fingerprint(options: ExportOptions) -> str:
     if view is not None and view.setup not in SETUPS.values():
         parts += [options.layout.groups, kinematics_source(options.layout)]
     digest = hashlib.sha256(repr(parts).encode())
-    for name, values in parameters_of(options.model, options.actuation).items():
+    for name, values in parameters_of(options.setup, options.config).items():
         digest.update(name.encode() + np.asarray(values).tobytes())
     for path in sorted(path for folder in PACKAGES for path in folder.rglob("*") if path.suffix in SOURCES):
         digest.update(str(path.relative_to(PACKAGES[0].parent)).encode() + path.read_bytes())
@@ -139,9 +144,9 @@ def product(options: ExportOptions) -> Product:
             summary=options.summary,
             layout=layout,
             sections=arm_sections(layout),
-            start=parameters_of(options.model, options.actuation),
+            start=parameters_of(options.setup, options.config),
             sources=c_files(options.fmi_version, CORE),
-            step=options.step,
+            step=options.setup.period,
         ),
         documentation=documentation(
             MODEL,
@@ -153,7 +158,7 @@ def product(options: ExportOptions) -> Product:
             feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
             mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
         ),
-        reference=reference_run(options.model, options.actuation, options.robot, options.step).tables(layout),
+        reference=reference_run(options.setup, options.config).tables(layout),
     )
 
 

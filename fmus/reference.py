@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.fmus.variables import BALL, FEATURE, SEEN, Actuation, Layout
+from servobench.fmus.variables import BALL, FEATURE, SEEN, Layout
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
-from servobench.plant.robot.hand_eye import RobotModel
-from servobench.plant.robot.robot import Robot
 
 STEPS = 200
 INPUT_FILE = "extra/servobench/reference_input.csv"
@@ -35,23 +33,21 @@ class ReferenceRun:
         return table(self.time, self.inputs, layout), table(self.time, self.outputs, layout)
 
 
-def reference_run(model: RobotModel, actuation: Actuation, robot: Robot, step: float) -> ReferenceRun:
-    """Return steps [s] of `model`, a `robot`, as the kinematic plant; some commands exceed the speed limit."""
-    lag, mechanics = float(actuation.lag), actuation.mechanics
-    config = KinematicConfig(actuation.max_speed, actuation.joint_range, lag, mechanics=mechanics)
-    world = KinematicWorld(config, PlantSetup(model, actuation.home, step, robot))
-    limit, n = world.spec.command.upper, model.arm.n
-    wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
+def reference_run(setup: PlantSetup, config: KinematicConfig) -> ReferenceRun:
+    """Return the reference run of the kinematic plant; some of its commands exceed the speed limit."""
+    world = KinematicWorld(config, setup)
+    limit = world.spec.command.upper
+    wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, world.spec.n))
     rows = []
     for command in np.clip(wanted, -limit, limit):
         state, feature, visible = world.save(), world.see(), world.visible()
         seen = np.ones_like(feature) if visible is None else visible.astype(np.float64)
         rows.append((state.q, state.v, feature, seen, state.q))
         world.advance(command)
-    measured = FEATURE if isinstance(model, SetupModel) else BALL
+    measured = FEATURE if isinstance(setup.model, SetupModel) else BALL
     names = ("joint_position", "joint_velocity", measured, SEEN, "encoder_position")
     outputs = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
-    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * step, {COMMAND: wanted}, outputs)
+    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * setup.period, {COMMAND: wanted}, outputs)
 
 
 def read_table(text: str) -> tuple[list[str], FloatArray]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from servobench.fmus.variables import BALL, FEATURE, SEEN, Actuation, View, parameters_of
+from servobench.fmus.variables import BALL, FEATURE, SEEN, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.registry import Sensing
@@ -17,10 +17,9 @@ from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Delay, JointSpeed, NonNegative, Positive, Usual, nested, settings
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.ur5 import UR5
 
 
 @settings
@@ -63,9 +62,9 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
         CompilationFailed: it has to be built and the compiler refused it.
         ValueError: it has to be built and the cache folder cannot be written.
     """
-    from servobench.fmus.export import export_fmu, fingerprint, nominal_options  # noqa: PLC0415 - loads CasADi
+    from servobench.fmus.export import ExportOptions, export_fmu, fingerprint, nominal_setup  # noqa: PLC0415 - CasADi
 
-    options = nominal_options(fmi_version, robot or find_robot(UR5), sensing)
+    options = ExportOptions(fmi_version, nominal_setup(robot, sensing))
     name = f"{options.identifier}.fmu"
     key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options)}"
     return cached("fmus", key, lambda folder: export_fmu(folder / name, options)) / name
@@ -73,18 +72,17 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
-    model, start = setup.robot()
+    model, _ = setup.robot()
     view = View.of(model) if isinstance(model, SetupModel) else None
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
     resolution, mechanics = config.encoder_resolution, config.mechanics
-    ends = config.max_joint_speed, config.joint_range
-    actuation = Actuation(np.array(lag), *ends, start, resolution, setup.limits, mechanics)
     mechanics.check(model)
-    stops = actuation.stops(n)
-    parameters = parameters_of(model, actuation)
+    own = KinematicConfig(config.max_joint_speed, config.joint_range, mechanics=mechanics)
+    parameters = parameters_of(setup, own) | {"lag": np.resize(lag, n), "encoder_resolution": np.full(n, resolution)}
     del parameters["home"]
+    stops = (parameters[name] for name in ("max_speed", "joint_lower", "joint_upper"))
     return FmuMapping(
         file=path,
         inputs=("joint_velocity_command",),
@@ -95,7 +93,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         home="home",
         camera=("camera_position", "camera_rpy") if view is None or view.setup.cameras == 1 else None,
         parameters=parameters,
-        limits=JointLimits(stops.speed, stops.lower, stops.upper),
+        limits=JointLimits(*stops),
         names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),
     )
 

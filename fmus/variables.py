@@ -15,17 +15,17 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
-from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import JointLimits, narrow_limits, rpy_from_rotation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.arm import narrow_limits, rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
-from servobench.plant.robot.mechanics import MechanicsConfig
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
 
 
-RIGID: Final = MechanicsConfig()  # without play, ripple and flexibility
 FEATURE: Final = "feature"
 BALL: Final = "ball_position"  # name of the feature without a set-up of cameras
 SEEN: Final = "seen"
@@ -221,28 +221,11 @@ class ArmLayout(Layout):
         return self.groups[[*self.by_name].index("encoder_position") + 1 :]
 
 
-@dataclass(frozen=True)
-class Actuation:
-    """Parameters of the model other than its geometry."""
-
-    lag: float | FloatArray  # time constant of the velocity loops [s], one for all joints or (n,)
-    max_speed: float  # limit of the joint speeds [rad/s]
-    joint_range: float  # distance of the stops from zero [rad]
-    home: FloatArray  # (..., n) reported joint positions at the start [rad]
-    encoder_resolution: float | FloatArray = 0.0  # step of the encoders [rad], one for all or (n,); 0 for exact ones
-    limits: JointLimits | None = None  # of the arm's maker, which hold as well; None for none
-    mechanics: MechanicsConfig = RIGID  # gears and tool
-
-    def stops(self, n: int) -> JointLimits:
-        """Return speeds and stops of `n` joints."""
-        return narrow_limits(self.limits, n, self.max_speed, self.joint_range)
-
-
-def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArray]:
-    """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
-    arm, n = model.arm, model.arm.n
-    stops = actuation.stops(n)
-    mechanics = actuation.mechanics
+def parameters_of(setup: PlantSetup, config: KinematicConfig) -> dict[str, FloatArray]:
+    """Return the FMU's parameters for the kinematic plant of these arguments by group, (..., size)."""
+    model, home = setup.robot()
+    arm, n, mechanics = model.arm, model.arm.n, config.mechanics
+    stops = narrow_limits(setup.limits, n, config.max_joint_speed, config.joint_range)
     columns = {"a": 0, "y": 1, "d": 2}
     angles = {"alpha": 0, "pitch": 1, "yaw": 2}
     return {
@@ -255,12 +238,12 @@ def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArr
         **_sensing_parameters(model),
         **{name: np.full(n, getattr(mechanics, name)) for name in ("backlash", "ripple", "ripple_order")},
         **{name: np.array([getattr(mechanics, name)]) for name in ("tool_frequency", "tool_damping")},
-        "lag": np.array(np.broadcast_to(actuation.lag, n)),
+        "lag": np.full(n, config.lag),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,
         "joint_upper": stops.upper,
-        "encoder_resolution": np.array(np.broadcast_to(actuation.encoder_resolution, n)),
-        "home": as_array("home", actuation.home, (*model.lead, n)),
+        "encoder_resolution": np.zeros(n),
+        "home": home,
     }
 
 

@@ -23,7 +23,7 @@ from servobench.fmus.controller_export import (
     ControllerModel,
     controller_groups,
 )
-from servobench.fmus.export import ExportOptions, default_actuation, product
+from servobench.fmus.export import ExportOptions, nominal_setup, product
 from servobench.fmus.product import Product
 from servobench.fmus.reference import ReferenceRun
 from servobench.fmus.trace.arrays import NotTraceable
@@ -35,13 +35,16 @@ from servobench.harness.run.experiment import Experiment, build, draw, draw_robo
 from servobench.harness.run.loop import LoopSettings, begin, periods
 from servobench.harness.run.request import RunRequest, find_robot
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections, select
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
+from servobench.plant.kinematic import KinematicConfig
 
 REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most
 TOLERANCE: Final = 1e-9
+USUAL: Final = KinematicConfig()  # lag and limits of an exported arm
 
 
 def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:
@@ -150,10 +153,13 @@ def _run(experiment: Experiment) -> ReferenceRun:
     )
 
 
-def arm_product(request: RunRequest, words: str, fmi: int = 2, step: float = 0.05, **actuation: Any) -> Product:  # noqa: ANN401
-    """Return the true arm of a run ready for export, with `words` on its mismatch and fields of its `Actuation`.
+def arm_product(
+    request: RunRequest, words: str, fmi: int = 2, own: PlantSetup | None = None, config: KinematicConfig = USUAL
+) -> Product:
+    """Return the true arm of a run ready for export, with `words` on its mismatch.
 
-    Its default experiment has steps of `step` [s].
+    Its start and period are those of a setup of its `own`, or home and the usual step; lag, limits and mechanics those
+    of the kinematic plant.
 
     Raises:
         ConfigurationError: a robot, sensing or mismatch that cannot be used.
@@ -162,9 +168,9 @@ def arm_product(request: RunRequest, words: str, fmi: int = 2, step: float = 0.0
     for part, _, name in (each.rpartition(".") for each in [*request.mismatch.plant_settings, *moves]):
         remedy = f", and set the FMU's parameter {name}" if part == "mechanics" else ""
         raise ConfigurationError(f"an arm is exported without {name}: leave it out{remedy}")
-    robot, (true, *_) = find_robot(request.robot), draw_robot(request)
-    usual = replace(default_actuation(robot), **actuation)
-    return product(ExportOptions(fmi, true, usual, mismatch=words, robot=robot, step=step))
+    true, *_ = draw_robot(request)
+    setup = replace(own or nominal_setup(find_robot(request.robot)), model=true)
+    return product(ExportOptions(fmi, setup, config, mismatch=words))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
@@ -184,8 +190,8 @@ def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Pro
             raise ConfigurationError(f"the arm of an SSP has {has}: leave {request.plant}.{key} out")
     scenario, run, config = draw(resolved).scenario, resolved.run, resolved.plant
     reference = scenario.reference.sampled(run.period, 1 + run.preview_rows)
-    words, own = f"{request.mismatch}, seed {request.seed}", {"lag": config.lag, "max_speed": config.max_joint_speed}
-    own |= {"joint_range": config.joint_range, "mechanics": config.mechanics, "home": scenario.start}
-    plant = arm_product(request, words, step=run.period, **own)
+    arm = KinematicConfig(config.max_joint_speed, config.joint_range, config.lag, mechanics=config.mechanics)
+    setup = PlantSetup(None, scenario.start, run.period, find_robot(request.robot))
+    plant = arm_product(request, f"{request.mismatch}, seed {request.seed}", 2, setup, arm)
     controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
     return plant, controller, scenario.duration

@@ -13,7 +13,7 @@ import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from kit.command import carried_out, python
-from kit.plants import mismatched, nominal_ur5, setup
+from kit.plants import mismatched, setup
 from servobench.fmus import compiler as compiling
 from servobench.fmus import export
 from servobench.fmus.compiler import (
@@ -24,15 +24,7 @@ from servobench.fmus.compiler import (
     parse_platforms,
     this_platform,
 )
-from servobench.fmus.export import (
-    PACKAGES,
-    ExportOptions,
-    arm_layout,
-    default_actuation,
-    export_fmu,
-    fingerprint,
-    nominal_options,
-)
+from servobench.fmus.export import PACKAGES, ExportOptions, arm_layout, export_fmu, fingerprint, nominal_setup
 from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
@@ -40,13 +32,14 @@ from servobench.fmus.variables import parameters_of
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import PIXEL, pixels
 from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
-from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mechanics import MechanicsConfig
 from servobench.plant.robot.ur5 import JOINT_NAMES
 
 VERSIONS = [2, 3]
+SEVERE = replace(nominal_setup(), model=mismatched("severe"))
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -58,8 +51,9 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
 
 
 def test_the_reference_run_agrees_with_play_ripple_and_a_flexible_tool(tmp_path):
-    own = replace(default_actuation(), mechanics=MechanicsConfig(backlash=0.02, ripple=0.02, tool_frequency=30.0))
-    found = validate_fmu(export_fmu(tmp_path / "arm.fmu", ExportOptions(actuation=own, step=0.02)))
+    own = KinematicConfig(mechanics=MechanicsConfig(backlash=0.02, ripple=0.02, tool_frequency=30.0))
+    options = ExportOptions(setup=replace(nominal_setup(), period=0.02), config=own)
+    found = validate_fmu(export_fmu(tmp_path / "arm.fmu", options))
     assert found.deviation < 1e-12
 
 
@@ -87,16 +81,16 @@ def model_of(p, joint_names):
 @pytest.mark.parametrize("mismatch", ["none", "severe", "factory", "gear_ratio=5%"])
 def test_a_model_comes_back_from_its_parameters(mismatch):
     model = mismatched(mismatch)
-    back = model_of(parameters_of(model, default_actuation()), JOINT_NAMES)
+    back = model_of(parameters_of(setup(mismatch), KinematicConfig()), JOINT_NAMES)
     np.testing.assert_allclose(back.X_BC, model.X_BC, rtol=0, atol=1e-12)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6))
     np.testing.assert_allclose(back.feature(q), model.feature(q), rtol=0, atol=1e-12)
 
 
 def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
-    path = export_fmu(tmp_path / "severe.fmu", ExportOptions(2, mismatched("severe"), mismatch="severe, seed 3"))
+    path = export_fmu(tmp_path / "severe.fmu", ExportOptions(2, SEVERE, mismatch="severe, seed 3"))
     starts = {each.name: each.start for each in read_information(path).description.modelVariables}
-    wanted = parameters_of(mismatched("severe"), default_actuation())
+    wanted = parameters_of(SEVERE, KinematicConfig())
     for group in arm_layout(6).of_role("parameter"):
         assert [float(starts[name]) for name in group.scalar_names()] == wanted[group.name].tolist()
     assert validate_fmu(path).problems == ()
@@ -108,11 +102,11 @@ def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
 def test_the_fingerprint_changes_with_whatever_an_fmu_is_made_from(monkeypatch, tmp_path):
     plain = fingerprint(ExportOptions(2))
     assert fingerprint(ExportOptions(2)) == plain
-    others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, mismatched("severe")))]
+    others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, SEVERE))]
     others.append(fingerprint(ExportOptions(2, platforms=tuple(PLATFORMS.values()))))
     for measure in (pixels, lambda points, optics: 2.0 * pixels(points, optics)):
         own = Sensing(replace(PIXEL, name="own", measure=measure))
-        others.append(fingerprint(nominal_options(2, find_robot("ur5"), own)))
+        others.append(fingerprint(ExportOptions(2, nominal_setup(sensing=own))))
     monkeypatch.setattr("servobench.fmus.export.CODE", ("-O3",))
     others.append(fingerprint(ExportOptions(2)))
     packages = [Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in PACKAGES]
@@ -271,6 +265,6 @@ def test_a_compiler_that_refuses_the_sources_is_quoted(tmp_path):
 
 
 def test_the_reference_run_meets_the_speed_limit():
-    run_ = reference_run(nominal_ur5(), default_actuation(), find_robot("ur5"), 0.05)
+    run_ = reference_run(nominal_setup(), KinematicConfig())
     assert (np.abs(run_.inputs["joint_velocity_command"]) > 1.0).any()
     assert np.abs(run_.outputs["joint_velocity"]).max() <= 1.0

@@ -1,10 +1,12 @@
 """Sensing set-ups as FMUs: against the kinematic eye, by the plant and by FMPy."""
 
+from dataclasses import replace
+
 import fmpy
 import numpy as np
 import pytest
 
-from servobench.fmus.export import ExportOptions, default_actuation, export_fmu
+from servobench.fmus.export import ExportOptions, export_fmu, nominal_setup
 from servobench.fmus.inspection import validate_fmu
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
 from servobench.plant.bench.plant import PlantSetup
@@ -96,7 +98,7 @@ def test_a_camera_that_moves_moves_in_the_fmu():
 @pytest.mark.parametrize("version", [2, 3])
 def test_fmpy_reads_features_in_pixels_and_cameras_are_parameters(tmp_path, version):
     model = true_model("stereo")
-    path = export_fmu(tmp_path / "stereo.fmu", ExportOptions(version, model, default_actuation(UR5), robot=UR5))
+    path = export_fmu(tmp_path / "stereo.fmu", ExportOptions(version, replace(nominal_setup(UR5), model=model)))
     assert validate_fmu(path).problems == ()
     names = [f"feature[{i + 1}]" for i in range(4)] if version == 2 else ["feature"]
     focal = "focal_length[1]" if version == 2 else "focal_length"

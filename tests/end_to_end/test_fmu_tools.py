@@ -21,8 +21,9 @@ from fmpy.ssp.ssd import read_ssd
 
 from kit.command import carried_out
 from kit.plants import configure, mismatched
+from kit.plants import setup as kinematic_setup
 from night.system_loops import Loop, agree, both, write
-from servobench.fmus.export import arm_layout, default_actuation
+from servobench.fmus.export import arm_layout
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.bench.plant import PlantSetup
@@ -54,7 +55,7 @@ def oracle(mismatch: str) -> np.ndarray:
 
 
 def parameters(mismatch: str):
-    return parameters_of(mismatched(mismatch), default_actuation())
+    return parameters_of(kinematic_setup(mismatch), KinematicConfig())
 
 
 def scalars(mismatch: str) -> dict[str, float]:

@@ -12,7 +12,6 @@ import psutil
 import pytest
 
 from kit.plants import configure, mismatched, setup
-from servobench.fmus.export import default_actuation
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.contract.faults import FmuError
@@ -151,9 +150,9 @@ def test_many_small_steps_end_where_one_large_step_ends(version):
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(version):
-    model, actuation = mismatched("severe"), default_actuation()
+    model = mismatched("severe")
     with Opened(version, start=False) as opened:
-        for name, values in parameters_of(model, actuation).items():
+        for name, values in parameters_of(setup("severe"), KinematicConfig()).items():
             opened.set(name, values)
         opened.instance.start(0.0)
         opened.set("joint_velocity_command", [0.5, 2.0, -2.0, 0.1, 0.0, -0.3])
@@ -166,7 +165,7 @@ def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(versio
         step = 1e-6 * np.eye(6)
         differences = [(model.jacobian(q + d) - model.jacobian(q - d)).ravel() / 2e-6 for d in step]
         np.testing.assert_allclose(hessian, np.column_stack(differences), atol=1e-8)
-        lag = np.diag(1.0 / actuation.lag * np.array([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))  # two commands are clipped
+        lag = np.diag(1.0 / KinematicConfig().lag * np.array([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))  # two are clipped
         np.testing.assert_allclose(opened.derivative("der(joint_velocity)", "joint_velocity_command"), lag)
         np.testing.assert_allclose(opened.derivative("der(joint_position)", "joint_velocity"), np.eye(6))
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import build_crane, describe_exchange, mapping
+from kit.plants import setup
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
-from servobench.fmus.export import default_actuation
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.harness.config.settings import Settings
@@ -25,6 +25,7 @@ from servobench.plant.fmu.description import read_description
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.fmu.model_exchange import FmuModel, build_model
 from servobench.plant.fmu.world import fmu_entry
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
@@ -78,7 +79,7 @@ def ur5_model(version: int, parameters=None, joints=("joint_position",)) -> FmuM
 
 
 def test_casadi_reads_the_equations_of_the_ur5_back():
-    parameters = parameters_of(mismatched("severe"), default_actuation())
+    parameters = parameters_of(setup("severe"), KinematicConfig())
     model = ur5_model(2, parameters)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
     np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)

@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 from kit.plants import factory_ur5, nominal_ur5
 from servobench.fmus.export import arm_layout
 from servobench.fmus.sources import core_functions
-from servobench.fmus.variables import Actuation, parameters_of
+from servobench.fmus.variables import parameters_of
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel, rotation_matrix
 from servobench.plant.robot.makers import CALIBRATION_BLOCKS, read_calibration
@@ -74,7 +76,7 @@ def random_model(seed, n=6):
 )
 def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     n, layout = model.arm.n, arm_layout(model.arm.n)
-    q, values = casadi.SX.sym("q", n), parameters_of(model, Actuation(0.05, 1.0, 2 * np.pi, np.zeros(n)))
+    q, values = casadi.SX.sym("q", n), parameters_of(PlantSetup(model, np.zeros(n), 0.05), KinematicConfig())
     p = casadi.DM(np.concatenate([np.ravel(values[group.name]) for group in layout.kinematic]))
     exported_feature, exported_jacobian, *_ = core_functions(layout)
     feature = symbolic_feature(model)(q)
