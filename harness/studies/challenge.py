@@ -7,12 +7,13 @@
                        the first `reference_seeds` robots, or on all
     [settings]         further settings, SECTION.KEY = VALUE, of the sections run, plant and task
     plants             those on which it is carried out unless a user names others
-    camera             a file beside this one with the camera of a user, in place of the bench's
+    camera             a file with the camera of a user, in place of the bench's
     [grade]            name, date and the mean scores of the methods that gave it, written once
 
 Grade I: all equipped methods pass. II: the best and the worst of them differ by a factor of three or by 30 points of
 lost runs, or another one is the first beyond its interval. III: the best is below half of the reference's score. The
-files of the folder `challenges` are known by their names; a user adds a challenge by the path of a file.
+files of the folder `challenges` are known by their names; a user adds a challenge by the path of a file. The files of
+its camera, of the code of its task and of the setting task.file are found from its folder.
 """
 
 import datetime
@@ -26,6 +27,7 @@ from typing import Any, Final, Literal, NamedTuple
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
+from servobench.harness.config.source import PLACE
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, with_camera
 from servobench.harness.run.resolution import resolve
@@ -172,8 +174,17 @@ def find_challenge(word: str) -> Challenge:
     path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
     values = read_toml("challenge", path)
     with configuration_errors(f"{path}: "):
-        values["task"] = choose_task(values.get("task", ""))
-        values |= {"camera": str(path.parent / values["camera"])} if "camera" in values else {}
         challenge = override("challenge", Challenge(path.stem), values)
+        task, given = challenge.task, flatten(challenge.settings)
+        if (place := PLACE.fullmatch(task)) and place["file"]:
+            task = f"{task[: place.start('file')]}{_seen(path, place['file'])}{task[place.end('file') :]}"
+        given |= {key: _seen(path, given[key]) for key in ("task.file",) if key in given}
+        camera = _seen(path, challenge.camera) if challenge.camera else ""
+        challenge = replace(challenge, task=choose_task(task), camera=camera, settings=given)
         challenge.check()
     return challenge
+
+
+def _seen(challenge: Path, file: str) -> str:
+    """Return the path of a file that a challenge names relative to its own folder."""
+    return str(challenge.parent / user_path(str(file)))

@@ -85,6 +85,20 @@ def test_a_bad_file_is_one_line_that_names_it_and_the_fault(tmp_path, text, mess
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.usefixtures("own_folder")
+def test_files_that_a_challenge_names_are_found_from_its_folder(tmp_path):
+    world = WORLD.replace("settling", "path")
+    write(
+        tmp_path, "from servobench.harness.run.tasks import LineTask\nclass Mine(LineTask):\n    'A line.'", "a/line.py"
+    )
+    write(tmp_path, "time_s,x_m,y_m,z_m\n0,0,0,1.3\n3,0.1,0,1.3\n", "a/way.csv")
+    own = write(tmp_path, world.replace("random", "own=./line.py:Mine"), "a/own.toml")
+    way = write(tmp_path, world.replace("random", "waypoints") + "settings.task.file = 'way.csv'", "a/way.toml")
+    found = choose_challenges([str(own), str(way)], [])
+    assert [each.task for each in found] == ["own", "waypoints"]
+    assert found[1].settings == {"task.file": str(tmp_path / "a" / "way.csv")}
+
+
 def test_challenges_are_chosen_by_name_file_and_grade(tmp_path):
     file = write(tmp_path, WORLD + 'grade = {name = "II", date = 2026-11-23}', "severe.toml")
     assert [each.title for each in choose_challenges([str(file)], ["II", "III"])] == ["A short move"]
