@@ -158,10 +158,10 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
         answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
     match answer.items:
         case [{"unreadable": [str(status), str(reason), str(trace)]}]:
-            return [_failed(job.cell, Ending(status, reason, trace)) for job in block.jobs], []
+            return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
     done, end = list[RunResult](), answer.end
     try:
-        done.extend(unpack_result(job.cell, item) for job, item in zip(block.jobs, answer.items, strict=False))
+        done.extend(unpack_result(job, item) for job, item in zip(block.jobs, answer.items, strict=False))
     except (ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
         end = End(Ending(CRASHED, reason), certain=False)
@@ -174,7 +174,7 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     rest = [single.part(at + 1)] if at + 1 < len(block.jobs) else []
     if not end.certain and not block.fresh:  # a fresh block is one run, and its own second attempt
         return done, [single.part(at, at + 1, fresh=True), *rest]
-    return [*done, _failed(block.jobs[at].cell, end.ending)], rest
+    return [*done, _failed(block.jobs[at], end.ending)], rest
 
 
 def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
@@ -271,7 +271,7 @@ def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, kee
             except BaseException as error:
                 if debug or ends_batch(error):
                     raise
-                tell(_failed(job.cell, Ending.of(error)))  # a plug-in may raise anything; the other runs go on
+                tell(_failed(job, Ending.of(error)))  # a plug-in may raise anything; the other runs go on
             else:
                 tell(_with_columns(job.cell, result))
 
@@ -280,8 +280,8 @@ def _with_columns(cell: Cell, result: RunResult) -> RunResult:
     return replace(result, row={**result.row, **cell.columns})
 
 
-def _failed(cell: Cell, ending: Ending) -> RunResult:
-    return _with_columns(cell, RunResult.failed(episode.identity(cell.request), ending))
+def _failed(job: Job, ending: Ending) -> RunResult:
+    return _with_columns(job.cell, RunResult.failed(episode.identity(job.run), ending))
 
 
 def pack_result(result: RunResult) -> dict[str, Any]:
@@ -291,7 +291,7 @@ def pack_result(result: RunResult) -> dict[str, Any]:
             "trace": result.trace}  # fmt: skip
 
 
-def unpack_result(cell: Cell, told: object) -> RunResult:
+def unpack_result(job: Job, told: object) -> RunResult:
     """Return the result of a run from the answer of a worker, in which code of users may have falsified anything.
 
     Raises:
@@ -304,11 +304,10 @@ def unpack_result(cell: Cell, told: object) -> RunResult:
             pass
         case _:
             raise ValueError("it is not the result of a run")
-    identity = episode.identity(cell.request)
-    known = {**RunResult.failed(identity, Ending()).row, **cell.columns}
+    identity, known = episode.identity(job.run), _failed(job, Ending()).row
     if missing := known.keys() - row.keys():
         raise ValueError(f"it lacks {min(missing)}")
-    own = (identity.keys() | cell.columns.keys()) - {"robot", "engine"}
+    own = (identity.keys() | job.cell.columns.keys()) - {"robot", "engine"}
     if len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1:  # NaN is NaN, but 1 not 1.0
         raise ValueError("it is that of another run")
     for name, wanted in _unfit_kinds(tuple((name, type(row[name]), type(known.get(name))) for name in row)):

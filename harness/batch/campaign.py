@@ -41,7 +41,7 @@ from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
@@ -278,8 +278,6 @@ def _jobs(campaign: Campaign, sections: Sections, together: bool, indices: Itera
     for index in indices:
         cell = campaign.cells[index]
         run = select(cell.request, sections)
-        if run.run.period != RunSettings.period:
-            cell = replace(cell, columns={**cell.columns, "period_s": run.run.period})
         yield Job(index, cell, run, side_by_side_key(run) if together and not cell.picture else None)
 
 

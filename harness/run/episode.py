@@ -67,7 +67,7 @@ def carry_out(
     if keep is not None:
         keep_networks(experiment.networks, keep)
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
-    row = _row(experiment.drawn, resolved.request, ending, _judge(logged, experiment), logged, pose)
+    row = _row(experiment.drawn, resolved, ending, _judge(logged, experiment), logged, pose)
     if not steps:
         return RunResult(row, None, image, ending.trace)
     table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(**pose)
@@ -117,7 +117,7 @@ def _judge_together(runs: Sequence[ResolvedRun], many: Experiment, ends: Ends, l
         else:
             ending, values = Ending(), {name: column[lane] for name, column in columns.items()}
         pose = pose_errors(drawn.true, drawn.scenario.reference, own)
-        results.append(RunResult(_row(drawn, run.request, ending, values, own, pose), None, trace=ending.trace))
+        results.append(RunResult(_row(drawn, run, ending, values, own, pose), None, trace=ending.trace))
     return results
 
 
@@ -129,7 +129,7 @@ def _judge(logged: Steps, experiment: Experiment) -> dict[str, FloatArray]:
 
 def _row(
     drawn: Drawn,
-    request: RunRequest,
+    run: ResolvedRun,
     ending: Ending,
     metrics: Mapping[str, npt.ArrayLike],
     logged: Steps,
@@ -142,11 +142,9 @@ def _row(
     if status == COMPLETED:
         times = numbers["settling_time_s"], numbers["rms_error_evaluated"]
         outcome = find_outcome(logged, drawn.scenario, *times, drawn.final)
-    usual = spec.period == RunSettings().period
     return {
-        **identity(request),
-        **({} if usual else {"period_s": spec.period}),
-        "robot": OWN_ROBOT if drawn.true is None else request.robot,
+        **identity(run),
+        "robot": OWN_ROBOT if drawn.true is None else run.request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
         "settling_band": spec.feature.band,
@@ -160,6 +158,7 @@ def _row(
     }
 
 
-def identity(request: RunRequest) -> dict[str, Any]:
-    """Return the columns that are known of a run before it is carried out."""
-    return {**request.as_row(), "engine": engine_of(request.plant)}
+def identity(run: ResolvedRun) -> dict[str, Any]:
+    """Return the columns that are known of a run before it is carried out, with an unusual period."""
+    period = {} if run.run.period == RunSettings.period else {"period_s": run.run.period}
+    return {**run.request.as_row(), **period, "engine": engine_of(run.request.plant)}

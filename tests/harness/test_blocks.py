@@ -22,7 +22,7 @@ from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Answer, End, Workers
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
 from servobench.plant.contract.faults import ConfigurationError
@@ -197,7 +197,7 @@ def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer
 
     def submit(task):
         block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
-        told = [blocks.pack_result(RunResult.failed(identity(each.cell.request), Ending())) for each in block.jobs]
+        told = [blocks.pack_result(RunResult.failed(identity(each.run), Ending())) for each in block.jobs]
         sizes.append(len(block.jobs))
         future = Future()
         end = End(Ending("crashed", "SIGTERM"), certain=False) if len(sizes) == 1 else None
@@ -212,7 +212,7 @@ def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer
 
 def job(index: int, kind: object) -> Job:
     request = RunRequest("kinematic", "constant", "random", "none", index)
-    return Job(index, Cell(request), ResolvedRun(request, None, None, None, None), kind)
+    return Job(index, Cell(request), ResolvedRun(request, RunSettings(), None, None, None), kind)
 
 
 def test_a_block_has_consecutive_runs_of_one_kind():
@@ -243,7 +243,7 @@ def test_blocks_are_made_when_a_worker_is_about_to_need_them():
     def submit(task):
         block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
         done = Future()
-        failed = (RunResult.failed(identity(each.cell.request), Ending("crashed")) for each in block.jobs)
+        failed = (RunResult.failed(identity(each.run), Ending("crashed")) for each in block.jobs)
         done.set_result(Answer([blocks.pack_result(result) for result in failed]))
         return done
 
@@ -279,7 +279,7 @@ def test_a_survey_finds_what_the_runs_are_without_keeping_them():
 
 
 def told(**changes: object) -> dict[str, object]:
-    row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row
+    row = RunResult.failed(identity(job(0, None).run), Ending()).row
     return {"row": row, "steps": None, "picture": None, "trace": ""} | changes
 
 
@@ -313,17 +313,17 @@ def steps_of(**values: object) -> str | None:
 )  # fmt: skip
 def test_an_answer_that_was_falsified_is_refused(answer, why):
     with pytest.raises(ValueError, match=why):
-        blocks.unpack_result(job(0, None).cell, answer)
+        blocks.unpack_result(job(0, None), answer)
 
 
 def test_a_result_is_the_same_after_its_way_through_a_process():
     numbers = {"step": np.arange(3), "time_s": 0.1 * np.arange(3), "error_norm": [0.1, np.nan, np.inf]}
     steps = pd.DataFrame({"run_id": "a", **numbers, "valid": [True] * 3})
-    row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row | {"rms_error": np.nan}
+    row = RunResult.failed(identity(job(0, None).run), Ending()).row | {"rms_error": np.nan}
     steps["run_id"] = row["run_id"]
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     packed = json.loads(json.dumps(blocks.pack_result(RunResult(row, steps, picture, "trace"))))
-    back = blocks.unpack_result(job(0, None).cell, packed)
+    back = blocks.unpack_result(job(0, None), packed)
     pd.testing.assert_frame_equal(back.steps, steps, check_exact=True)
     np.testing.assert_array_equal(back.picture, picture)
     assert list(back.row) == list(row)
