@@ -51,19 +51,18 @@ def carry_out(
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
     experiment = build(resolved)
-    plant, log, ending = experiment.plant, StepLog(experiment.plant.spec, experiment.periods), Ending()
-    try:
-        with careful():
+    log, ending = StepLog(experiment.plant.spec, experiment.periods), Ending()
+    with contextlib.closing(experiment.plant) as plant, careful():
+        desired = experiment.desired()
+        try:
             pair = held_to_contract(plant, experiment.controller)
-            run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
-    except BaseException as error:
-        if ends_batch(error) or (debug and not isinstance(error, RunFault)):
-            raise
-        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
-    finally:
+            run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
+        except BaseException as error:
+            if ends_batch(error) or (debug and not isinstance(error, RunFault)):
+                raise
+            ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
-        plant.close()
     if keep is not None:
         keep_networks(experiment.networks, keep)
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)

@@ -54,15 +54,19 @@ class Drawn:
     """The values drawn for one run."""
 
     scenario: Scenario
-    true: RobotModel | None = None  # the true robot and its cameras; None for a plant that brings its own
+    setting: TaskSetting  # of the task, with the true robot
     sample: MismatchSample | None = None  # how it differs from the nominal one
-    moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
     cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
+
+    @property
+    def true(self) -> RobotModel | None:
+        """The true robot and its cameras; None for a plant that brings its own."""
+        return self.setting.model
 
     @property
     def final(self) -> RobotModel | None:
         """The true robot with the camera as it is at the end of the run."""
-        return self.moved or self.true
+        return self.setting.moved or self.true
 
     def as_record(self) -> dict[str, object]:
         """Return all values drawn for robot and cameras, for JSON."""
@@ -84,7 +88,7 @@ def draw(resolved: ResolvedRun) -> Drawn:
         raise ConfigurationError(f"sensing {request.sensing}: {wanted}, got the shape {made} for two postures")
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
-    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+    return Drawn(build_scenario(resolved, setting), setting, sample, cameras)
 
 
 @configuration_errors()
@@ -130,11 +134,6 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:  # a move is judged by its settling
             part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
             raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
-        if name not in TASKS:
-            again: Any = task.scenario(setting)
-            starts: list[Any] = [scenario.start, again.start]
-            if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
-                raise ConfigurationError("its scenario differs from one call to the next; draw from setting.seed alone")
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
@@ -170,7 +169,7 @@ class Experiment:
     def loop(self) -> LoopSettings:
         """The settings of the loop, with the camera's pose (..., 4, 4) after a move."""
         run, periods = self.run, self.periods
-        moved = [each.moved.camera for each in self.runs if each.moved is not None]
+        moved = [each.setting.moved.camera for each in self.runs if each.setting.moved is not None]
         move = CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
         return LoopSettings(periods, run.preview_rows, run.periods(run.lost_after), move)
 
@@ -215,7 +214,8 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
         setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
-        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks)
+        drawn = Drawn(build_scenario(resolved, setting), setting)
+        return Experiment(plant, controller, (drawn,), resolved.run, networks)
     except BaseException:
         plant.close()
         raise
@@ -271,6 +271,7 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     try:
         experiment = build(run, progress=progress)
         experiment.plant.close()
+        _check_repeats(run, experiment.drawn)
         _check_features(run, experiment)
     except ConfigurationError:
         raise
@@ -299,6 +300,19 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
                 wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
                 raise ConfigurationError(f"task {run.request.task}: {what} must be {wanted}, got {value:g}")
     _check_reach(run, scenario, spec)
+
+
+def _check_repeats(run: ResolvedRun, drawn: Drawn) -> None:
+    """Refuse a user's task that makes another scenario for the same setting."""
+    if run.request.task in TASKS:
+        return
+    again, times = run.task.scenario(drawn.setting), np.linspace(0.0, drawn.scenario.duration, POINTS)
+    first, other = (
+        (each.reference.at(times).tolist(), np.array(each.start).tolist()) for each in (drawn.scenario, again)
+    )
+    if first != other:
+        differs = "its scenario differs from one call to the next; draw from setting.seed alone"
+        raise ConfigurationError(f"task {run.request.task}: {differs}")
 
 
 def _check_features(run: ResolvedRun, experiment: Experiment) -> None:

@@ -45,8 +45,15 @@ class Reference(ABC):
         Args:
             period: control period [s].
             count: periods of the run and the rows that are previewed beyond its end.
+
+        Raises:
+            ConfigurationError: one of them is not finite.
         """
-        rows = self.at(np.arange(count) * period)
+        rows = np.array(self.at(np.arange(count) * period), dtype=np.float64)
+        if not (finite := np.isfinite(rows).all(axis=-1)).all():
+            first = int(finite.argmin())
+            wanted = "the reference of the task must be finite over the run and beyond it, as far as it is previewed"
+            raise ConfigurationError(f"{wanted}; got {rows[first].tolist()} at {first * period:g} s")
         rows.flags.writeable = False
         return rows
 

@@ -127,7 +127,7 @@ def test_a_plant_without_a_camera_is_shown_from_outside_with_its_ball_and_the_ta
         red = np.argwhere((picture[..., 0] > 120) & (picture[..., 1:] < 60).all(axis=-1))
         (ball,), _ = view.pixels(drawn.true.arm.ball_position(env.observation.joint_position)[None])
         np.testing.assert_allclose(red.mean(axis=0)[::-1], ball, atol=3.0)
-        model = drawn.moved if k else drawn.true
+        model = drawn.final if k else drawn.true
         (target,), _ = view.pixels(model.to_base(env._rollout.reference[0])[None])
         x, y = np.round(target).astype(int)
         np.testing.assert_array_equal(picture[y, x], MARK)

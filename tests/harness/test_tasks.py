@@ -16,12 +16,21 @@ from kit.own import CELL, WHOLE, install, write
 from kit.resting import Resting
 from servobench.harness.config import registry
 from servobench.harness.config.registry import offering
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import build_once
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 from servobench.harness.run.tasks import TASKS, choose_task, find_task
 from servobench.plant.contract.faults import ConfigurationError
 
 PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
 (SPIRAL,) = (block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block)
 pytestmark = pytest.mark.usefixtures("own_folder")
+ENDS = """from servobench.harness.run.references import FixedPoint
+class Ends(FixedPoint):
+    def at(self, time):
+        return np.where(np.asarray(time)[..., None] < 1.04, super().at(time), np.nan)
+"""
 WRONG = "from servobench import TaskEntry\nENTRY = TaskEntry('wrong', 'a number', 3)"
 
 
@@ -99,13 +108,23 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
          r"its .* 3 finite features .*got shape \(12, 2\)"),
         (("self.duration / 2)", "self.duration - 0.01)"), ".*begins at 0.99 s, after the last .* at 0.95 s"),
         (("self.duration / 2)", "self.duration / 2, 'point')"), "kind must be one of .*, got 'point'"),
-        (("self.radius * times", "np.random.random() * times"), "its scenario differs from one call to the next"),
+        (("Waypoints(times, points)", "Ends(np.zeros(3))"), "the ref.*finite.*got .nan, nan, nan. at 1.05 s"),
     ],
 )  # fmt: skip
 def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, change, words):
-    write(tmp_path, "from servobench.harness.run.references import FixedPoint\n" + SPIRAL.replace(*change), "spiral.py")
-    with pytest.raises(ConfigurationError, match=f"^task Spiral: {words}"):
+    write(tmp_path, ENDS + SPIRAL.replace(*change), "spiral.py")
+    with pytest.raises(ConfigurationError, match=f"^(task Spiral: )?{words}"):
         servobench.run("constant", task="./spiral.py")
+
+
+def test_a_task_is_asked_once_a_run_and_once_more_a_batch_to_refuse_one_that_draws_anew(tmp_path, capsys):
+    write(tmp_path, SPIRAL.replace("        times =", "        print('asked')\n        times ="), "spiral.py")
+    servobench.run("constant", task="./spiral.py")
+    assert capsys.readouterr().out.count("asked") == 1
+    write(tmp_path, SPIRAL.replace("self.radius * times", "np.random.random() * times"), "drawn.py")
+    request = RunRequest("kinematic", "constant", choose_task("drawn=./drawn.py"), "moderate", 0)
+    with pytest.raises(ConfigurationError, match="^task drawn: its scenario differs from one call to the next"):
+        build_once(resolve(request, Settings()))
 
 
 def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_path):
