@@ -7,6 +7,7 @@ import keyword
 import os
 import re
 import sys
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -185,6 +186,9 @@ def identify(
     if own.twin:
         wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
         raise ConfigurationError(f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}")
+    if not log.is_dir():  # a table does not say at which speed commands are clipped: at that of the robot
+        plant = replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
+        resolved = replace(resolved, plant=plant)
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
     experiment.plant.close()

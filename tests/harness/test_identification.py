@@ -117,7 +117,7 @@ def driven(commands, period=0.05):
 
 @pytest.mark.parametrize(("gain", "clipped", "level"), [(1.0, 0.1, 0.1), (10.0, 1.5, 1.5), (10.0, np.inf, np.inf)])
 def test_delay_and_lag_are_found_although_commands_are_clipped_elsewhere(gain, clipped, level):
-    """The spec of a table has the limit of 1 rad/s, whatever that of the robot is."""
+    """The limit of this log is 1 rad/s."""
     log = logged()[0]
     u = gain * log.commands
     response = command_response(log._replace(commands=u, joints=driven(np.clip(u, -clipped, clipped))))
@@ -475,6 +475,15 @@ def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path,
     monkeypatch.chdir(out.parent)
     row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row
     assert row["outcome"] == "settled"
+
+
+def test_commands_of_a_table_are_clipped_where_its_robot_is(output_of, tmp_path):
+    fast = SETTINGS | {"Excite": {"fastest": 0.7, "swing": 0.4}}
+    fast["kinematic"] = SETTINGS["kinematic"] | {"max_joint_speed": 2.0}
+    made = run("docs/examples/excite.py", task="random", robot=ROBOT, mismatch=MISMATCH, seed=SEED, settings=fast).steps
+    assert 1.5 < made.filter(like="_velocity_command_").abs().max(axis=None) < 2.0
+    made.to_csv(tmp_path / "fast.csv", index=False)
+    assert "clipped" not in output_of("identify", tmp_path / "fast.csv", "--robot", ROBOT)
 
 
 def test_a_twin_of_a_twin_is_refused_before_the_work(refusal_of, tmp_path):
