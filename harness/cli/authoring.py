@@ -132,7 +132,7 @@ def shadow(
     Nothing is simulated: its commands do not change the log. Its Jacobian predicts each feature from the frame before.
     """
     from servobench.harness.config.registry import find_controller
-    from servobench.harness.run.shadow import differences, has_commands, predictions
+    from servobench.harness.run.shadow import differences, predictions
     from servobench.harness.run.shadow import shadow as see
 
     chosen = None if controller is None else selection.choose("controllers", controller)
@@ -141,17 +141,17 @@ def shadow(
     resolved, table = _logged(log, run, chosen, (robot, sensing), out)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
-    name, ahead = resolved.request.controller, predictions(seen)
+    name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
     if out is not None:
         with writing(out):
             write_csv(seen, out)
         say(f"table in {out}")
-    elif not has_commands(seen) and ahead.empty:
+    elif apart.empty and ahead.empty:
         raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
     if ahead.empty:
         say(f"{name} gives no Jacobian that could predict a feature")
-    tables = [(f"{name} beside the log", differences(seen))] if has_commands(seen) else []
-    tables += [(f"Features one frame ahead, by the Jacobian of {name}", ahead)] * (not ahead.empty)
+    titles = f"{name} beside the log", f"Features one frame ahead, by the Jacobian of {name}"
+    tables = [(title, rows) for title, rows in zip(titles, (apart, ahead), strict=True) if not rows.empty]
     words = [(title, rows.map(lambda each: each if isinstance(each, str) else f"{each:.3g}")) for title, rows in tables]
     print_tables(words, LEGEND)
 

@@ -23,6 +23,7 @@ from scipy.interpolate import CubicSpline  # which loads the others, too
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from servobench.controllers.algebra import nearest_rotation
 from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -75,8 +76,20 @@ class Log(NamedTuple):
     valid: BoolArray  # (k,) of rows with a new frame
     commands: FloatArray | None  # (k, n) [rad/s], each from its row to the next
 
-    def wrapped_joint(self) -> str:
-        """Name a joint that jumps by a turn from one row to the next, far beyond its speed; empty for none."""
+    def farthest_joint(self) -> tuple[float, str]:
+        """Return how far a joint is beyond its range at most [rad], and where that is."""
+        q, lower, upper = self.joints, self.spec.joint_lower, self.spec.joint_upper
+        beyond = np.maximum(q - upper, lower - q)
+        row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
+        place = f"row {row} of the log has {self.spec.joint_names[joint]} at {q[row, joint]:.4g} rad"
+        limits = f"{lower[joint]:.4g} to {upper[joint]:.4g} rad"
+        return float(beyond[row, joint]), f"{place}, beyond its range of {limits}"
+
+    def joint_mistake(self) -> str:
+        """Name joints in degrees, or one that jumps by a turn from row to row, far beyond its speed; empty for none."""
+        excess, where = self.farthest_joint()
+        if excess > np.pi:
+            return f"{where}; if the log is in degrees, write it in rad"
         jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
         jumps[np.abs(jumps - 2.0 * np.pi) > MAX_OFF_TURN] = 0.0
         row, joint = np.unravel_index(int(jumps.argmax()), jumps.shape)
@@ -356,13 +369,11 @@ def _by_pixels(model: SetupModel, joints: FloatArray, features: FloatArray) -> t
 
 def _by_places(model: RobotModel, joints: FloatArray, features: FloatArray) -> tuple[FloatArray, FloatArray]:
     points, poses = model.arm.ball_position(joints), np.tile(np.eye(4), (len(joints), 1, 1))
-    weights, unit = np.ones(points.shape[:2]), np.ones((len(joints), 3))
+    weights = np.ones(points.shape[:2])
     for _ in range(5):  # Kabsch's rotation with the weights of Weiszfeld's median
         share = (weights / weights.sum(axis=1, keepdims=True))[:, None]
         middle, mean = share @ points, share @ features
-        U, _, V = np.linalg.svd((points - middle).mT @ ((features - mean) * share.mT))
-        unit[:, 2] = np.linalg.det(U @ V)
-        R = U * unit[:, None] @ V
+        R = nearest_rotation((points - middle).mT @ ((features - mean) * share.mT))
         place = middle - mean @ R.mT
         distance = np.linalg.norm(features - (points - place) @ R, axis=2)
         errors = np.median(distance, axis=1)

@@ -53,7 +53,7 @@ def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> t
         model: nominal robot under the sensing of the log.
         others: nominal models of other arms with as many joints, by name.
     """
-    found = _units(log, model) or log.wrapped_joint() or _repeats(log)
+    found = log.joint_mistake() or _units(log, model) or _repeats(log)
     if found:
         return found, None
     robot = identify(log, model)
@@ -118,16 +118,10 @@ def _zeros(log: Log, model: RobotModel) -> dict[str, float]:
 
 
 def _units(log: Log, model: RobotModel) -> str:
-    """Name joints that are likely in degrees and features that are likely in a smaller unit than m."""
-    spec, q = log.spec, log.joints
-    beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
-    if beyond.max() > math.pi:
-        row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
-        where = f"joint {spec.joint_names[joint]} is at {q[row, joint]:.4g} rad in row {row}, far beyond its range"
-        return f"{where}: the log is likely in degrees; write joint positions in rad"
+    """Name features that are likely in a smaller unit than m."""
     rows = frames_of(log)
-    moved, made = (np.linalg.norm(_spread(each)) for each in (log.features[rows], np.asarray(model.feature(q[rows]))))
-    if spec.feature.unit == "m" and moved > MAX_RATIO * made:
+    made, moved = (np.linalg.norm(_spread(each)) for each in (model.feature(log.joints[rows]), log.features[rows]))
+    if log.spec.feature.unit == "m" and moved > MAX_RATIO * made:
         found = f"features move by {moved:.3g} where this arm moves its ball by {made:.3g} m"
         unit = min(UNITS, key=lambda unit: abs(math.log(moved / max(float(made), 1e-9) * UNITS[unit])))
         return f"{found}: they are likely in {unit}; write them in m"

@@ -10,7 +10,6 @@ The Jacobian Ĵ_k that the controller holds at a valid frame k, learned up to th
 with the logged joint positions q and the delay d_k of the camera that the controller has identified, 0 without one.
 """
 
-import math
 from typing import Final, final
 
 import numpy as np
@@ -80,17 +79,11 @@ class LoggedPlant(Plant):
         Raises:
             ConfigurationError: names the row, and the unit in which the log has to be.
         """
-        spec, q = self.spec, self.log.joints
-        beyond = np.maximum(q - spec.joint_upper, spec.joint_lower - q)
-        row, joint = np.unravel_index(int(beyond.argmax()), q.shape)
-        name, limits = spec.joint_names[joint], f"{spec.joint_lower[joint]:.4g} to {spec.joint_upper[joint]:.4g} rad"
-        where = f"row {row} of the log has {name} at {q[row, joint]:g} rad, beyond its range of {limits}"
-        if beyond.max() > math.pi:
-            raise ConfigurationError(f"{where}; if the log is in degrees, write it in rad")
-        if beyond.max() > MAX_EXCESS:
+        spec, (excess, where) = self.spec, self.log.farthest_joint()
+        if mistake := self.log.joint_mistake():
+            raise ConfigurationError(mistake)
+        if excess > MAX_EXCESS:
             remark(where)
-        if wrapped := self.log.wrapped_joint():
-            raise ConfigurationError(wrapped)
         for kind, values in (("feature", self.log.features), ("reference", self.reference)):
             sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
             far, size = int(sizes.argmax()), float(sizes.max())
@@ -237,23 +230,16 @@ def _apart(y: FloatArray, p: FloatArray, unit: str) -> tuple[float, bool]:
     return rest / (max(seen, made) if unit == "m" else seen), bool(sided and np.linalg.det(image[:2, :2]) < 0.0)
 
 
-def has_commands(steps: pd.DataFrame) -> bool:
-    """Return whether a table of `shadow` has the commands of its log."""
-    return any(str(name).startswith(LOGGED) for name in steps)
-
-
 def differences(steps: pd.DataFrame) -> pd.DataFrame:
     """Return how far the commands of a table of `shadow` are from those of its log.
 
     Returns:
         A row a command: RMS of the logged one, RMS and largest of the difference, in the unit that its name ends with.
-
-    Raises:
-        ConfigurationError: the log had no commands.
+        Empty where no commands were logged.
     """
     logged = [name for name in map(str, steps) if name.startswith(LOGGED)]
     if not logged:
-        raise ConfigurationError(f"the log has no commands to compare with, columns {COMMAND}_…")
+        return pd.DataFrame()
     names = [name.removeprefix(LOGGED) for name in logged]
     was, apart = steps[logged].to_numpy(), steps[names].to_numpy() - steps[logged].to_numpy()
     rms = (np.sqrt(np.mean(each**2, axis=0)) for each in (was, apart))

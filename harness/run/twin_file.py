@@ -170,7 +170,8 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     swing = math.hypot(found.get("swing_sin", 0.0), found.get("swing_cos", 0.0))
     spread, steady, kept = _lateness(log, robot)
     noise, outliers, waiting = robot.noise, ~robot.inliers, Waiting(0.0, 0.0, 0.0)
-    lost, gap = lost_share(log), usual_gap(log)
+    lost, missing = lost_share(log), missing_frames(log)
+    gap = float(np.median(missing[missing > 0.0])) if missing.any() else 0.0  # of frames in a row
     if swing > MIN_LATE:
         sensing |= {"latency_swing": swing, "swing_period": robot.swing_period}
         waiting = arrivals(log.spec.period, 0.0, swing, robot.swing_period)
@@ -230,12 +231,6 @@ def arrivals(period: float, jitter: float, swing: float = 0.0, swing_period: flo
     wave = np.sin(2.0 * np.pi * period * newest[new] / swing_period)
     size = float(np.cov(wave, age)[0, 1] / max(wave.var(), 1e-9))
     return Waiting(float(age.mean()), float(age.std()), 1.0 - len(age) / len(instants), size)
-
-
-def usual_gap(log: Log) -> float:
-    """Return how many frames are missing in a row where any is."""
-    missing = missing_frames(log)
-    return float(np.median(missing[missing > 0.0])) if missing.any() else 0.0
 
 
 def twin_text(robot: Identified, log: Log, response: Response | None, named: tuple[str, str]) -> str:

@@ -286,7 +286,7 @@ MISTAKES = {
     "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
     "repeated": (repeated, r"25% of the frames repeat the one before although the arm moves, first in row \d+"),
     "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
-    "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "likely in degrees; write joint positions"),
+    "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "; if the log is in degrees, write it in rad"),
     "centimetres": (lambda log: log._replace(features=1e2 * log.features), "likely in cm; write them in m"),
     "inches": (lambda log: log._replace(features=log.features / 0.0254), "likely in inches; write them in m"),
     "millimetres": (lambda log: log._replace(features=1e3 * log.features), "likely in mm; write them in m"),
