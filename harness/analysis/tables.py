@@ -60,6 +60,8 @@ from servobench.harness.run.outcome import (
 )
 from servobench.harness.run.request import SECTIONS, SHORT_NAMES, varied_columns
 from servobench.harness.run.result import COMPLETED
+from servobench.harness.run.scenario import Task
+from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
@@ -194,12 +196,21 @@ def summary_legend(runs: pd.DataFrame) -> str:
     """Return the meaning of the words in `summary_tables`, a line each."""
     lines = [
         outcome_legend([runs]),
-        "judged part: the last lap; of a line, the second half" * (len(split_tasks(runs)[1]) > 0),
+        _judged_parts(split_tasks(runs)[1]["task"].unique()),
         "sign switches: large joint commands of opposite sign within two periods",
         "numbers: medians over runs" * (len(runs) > 1),
         f"{LATE} some steps took longer than the period" * _is_late(runs),
     ]
     return "\n".join(filter(None, lines))
+
+
+def _judged_parts(curves: Iterable[str]) -> str:
+    """Return the judged part of each of these tasks in words; a task of a user's names its own in its code."""
+    parts: dict[str, list[str]] = {}
+    for name in curves:
+        task = TASKS[name].default if name in TASKS else Task
+        parts.setdefault(task.judged_part, []).append(name)
+    return "; ".join(f"judged part of {', '.join(names)}: {part}" for part, names in parts.items())
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:

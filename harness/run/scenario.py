@@ -101,6 +101,8 @@ class Task(ABC):
     """Whether it also runs on a plant with a robot of its own: no target is given as joint positions."""
     places: ClassVar[tuple[str, ...]] = ()
     """Settings that are moved for another arm: points of the camera frame, and `start`, which is its home."""
+    judged_part: ClassVar[str] = "from its evaluate_from on"
+    """Words for the judged part of a curve."""
 
     @property
     def taught_at(self) -> Vector | None:

@@ -163,6 +163,7 @@ class CurveTask(Task):
 
     any_robot: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("start", "centre")
+    judged_part: ClassVar[str] = "the last lap"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -198,6 +199,7 @@ class LineTask(Task):
 
     any_robot: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("start", "begin", "end")
+    judged_part: ClassVar[str] = "the second half"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
@@ -219,6 +221,7 @@ class WaypointTask(Task):
 
     any_robot: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("start",)
+    judged_part: ClassVar[str] = "the second half"
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""

@@ -205,6 +205,16 @@ def test_a_controller_slower_than_the_period_is_marked_and_counted():
     assert "*" not in summary_legend(runs.tail(1))
 
 
+def test_the_judged_part_is_named_for_each_curve_and_that_of_a_user_s_task_is_its_own():
+    curves = pd.DataFrame(
+        [made_up_row(task, task=task, task_kind="curve") for task in ("circle", "line", "Spiral", "waypoints")]
+    )
+    assert summary_legend(curves).splitlines()[1] == (
+        "judged part of circle: the last lap; judged part of line, waypoints: the second half; "
+        "judged part of Spiral: from its evaluate_from on"
+    )
+
+
 def test_the_outcomes_of_several_runs_are_shares():
     words = ["settled", "settled", "target_unreachable", "settled"]
     runs = pd.DataFrame([made_up_row(str(i), seed=i, outcome=word) for i, word in enumerate(words)])
