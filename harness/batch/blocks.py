@@ -219,13 +219,13 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
 
 def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
     """Build a run in a worker and report the training of its networks, and a wrong configuration."""
-    block, *_ = _receive(packed)
-    tell(None)
-    with offering(block.own):
-        try:
+    try:
+        block, *_ = _receive(packed)
+        tell(None)
+        with offering(block.own):
             build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
-        except ConfigurationError as error:
-            tell(str(error))
+    except ConfigurationError as error:
+        tell(str(error))
     for text in REMARKS:
         tell(["remark", text])
 
@@ -242,11 +242,21 @@ def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -
 
 
 def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
-    """Return the content of a task, and import its plant and controller; the row tells of one that cannot be."""
+    """Return the content of a task, and import its plant and controller; the row tells of one that cannot be.
+
+    Raises:
+        ConfigurationError: a class of the user's is not there where its file is imported.
+    """
     sources, content = packed
     for source in sources:
         source.load()
-    unpacked: tuple[Block, bool, Path | None] = pickle.loads(content)
+    try:
+        unpacked: tuple[Block, bool, Path | None] = pickle.loads(content)
+    except AttributeError as error:
+        raise ConfigurationError(
+            f"a worker process lacks a class: {error}; define it above `if __name__ == '__main__':`, as workers import "
+            "the file without the lines below, or compare with workers=1 and without limits"
+        ) from error
     block, *_ = unpacked
     request = block.jobs[0].cell.request
     with offering(block.own), contextlib.suppress(BaseException):

@@ -7,6 +7,7 @@ worlds get a `PlantSetup` in place of the knowledge; a world is put on a bench. 
 line with their place, and answers of a world are checked.
 """
 
+import contextlib
 import hashlib
 import inspect
 import re
@@ -404,7 +405,7 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
     found = _members(kind, module)
     if name is not None:
         if not hasattr(module, name):
-            hint = suggest(name, found) if found else f"it defines no {kind.word}"
+            hint = suggest(name, found) if found else f"it defines no {kind.word}{_guard_hint(module)}"
             raise ConfigurationError(f"{where} has no {name!r}: {hint}")
         return getattr(module, name)
     entry = getattr(module, "ENTRY", None)
@@ -415,10 +416,18 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
     if not found:
         bases = " or ".join(f"servobench.{each.__name__}" for each in kind.bases)
         others = [f"the {other.word} {each}" for other in (CONTROLLER, PLANT) for each in _members(other, module)]
-        hint = f"; it defines {' and '.join(others)}" if others else ""
+        hint = f"; it defines {' and '.join(others)}" if others else _guard_hint(module)
         raise ConfigurationError(f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY{hint}")
     first, *_ = found
     raise ConfigurationError(f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}")
+
+
+def _guard_hint(module: ModuleType) -> str:
+    """Return the remedy for a script whose classes may be in the part that only runs as a script; else empty."""
+    with contextlib.suppress(OSError, TypeError):  # no file with source
+        if "__main__" in inspect.getsource(module):
+            return "; define it above `if __name__ == '__main__':`"
+    return ""
 
 
 def _members(kind: Kind[Any], module: ModuleType) -> dict[str, object]:

@@ -1,6 +1,8 @@
 """`import servobench` as a user's script sees it."""
 
+import os
 import re
+import sys
 from functools import partial
 
 import numpy as np
@@ -22,6 +24,28 @@ def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
 
     table = servobench.compare([Local], settings=SHORT, workers=2)
     assert table["status"].tolist() == ["completed"]
+
+
+BELOW_THE_GUARD = """
+import servobench
+from kit.resting import Resting
+
+if __name__ == "__main__":
+    class Mine(Resting):
+        pass
+    servobench.compare([Mine], isolate=True)
+"""
+
+
+def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(tmp_path):
+    (tmp_path / "script.py").write_text(BELOW_THE_GUARD)
+    remedy = "define it above `if __name__ == '__main__':`"
+    line = python("script.py", path=tmp_path, PYTHONPATH=os.pathsep.join(sys.path)).stderr.splitlines()[-1]
+    assert "a worker process lacks a class: Can't get attribute 'Mine'" in line
+    assert remedy in line
+    for place in ("script.py", "script.py:Mine"):
+        with pytest.raises(ValueError, match=f"defines no controller.*{remedy}"):
+            servobench.run(f"{tmp_path}/{place}")
 
 
 def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
