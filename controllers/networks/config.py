@@ -42,7 +42,7 @@ class ControllerTraining:
     """[1] L_e, errors in ξ."""
     position_history: Count = 1
     """[1] L_c, joint positions in ξ."""
-    hidden: Count = 60
+    hidden: Annotated[int, Ge(2)] = 60
     """[1] N_h, units."""
     kernel: Kernel = "exponential"
     """Of eq. 16; "gaussian" squares the norm."""
@@ -96,6 +96,9 @@ class TrainingConfig:
             raise ValueError(f"lower and upper must be equally long, got {len(self.lower)} and {len(self.upper)}")
         if any(low >= high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"lower must be below upper for every joint, got {self.lower} and {self.upper}")
+        fewest = min(self.jacobian.samples, self.controller.samples)
+        if round(fewest * self.held_out) == fewest:
+            raise ValueError(f"held_out leaves none of {fewest} samples for the fit, got {self.held_out:g}")
 
     def region(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the box, two arrays (n,) [rad].

@@ -134,7 +134,7 @@ def main() -> None:
         code = INTERRUPTED
     except typer.TyperException as error:
         _end(_usage_line(error))
-    except (ValueError, ImportError, RecursionError) as error:
+    except (ValueError, ImportError, RecursionError, MemoryError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
@@ -187,7 +187,7 @@ def _line_of_system(error: OSError) -> str | None:
     return f"{os.strerror(error.errno)} ({error.filename or 'in the temporary folder or in the one that is written'})"
 
 
-def _line_for_user(error: ValueError | ImportError | RecursionError) -> str | None:
+def _line_for_user(error: ValueError | ImportError | RecursionError | MemoryError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
 
@@ -195,6 +195,8 @@ def _line_for_user(error: ValueError | ImportError | RecursionError) -> str | No
         return missing_extra(error, "this command")
     if isinstance(error, RecursionError) and "--debug" not in sys.argv:
         return "the input is nested too deeply"
+    if isinstance(error, MemoryError) and "--debug" not in sys.argv:
+        return f"the memory is not enough: {error or 'no more is free'}; make the work smaller, or use fewer workers"
     return str(error) if isinstance(error, ConfigurationError) else None
 
 

@@ -304,6 +304,8 @@ REFUSED = [
     (lambda: JacobianTraining(centres=60, samples=59), "samples must be at least the 60 centres, got 59"),
     (lambda: TrainingConfig((0.0,), (1.0, 1.0)), "lower and upper must be equally long, got 1 and 2"),
     (lambda: TrainingConfig((1.0,), (1.0,)), "lower must be below upper"),
+    (lambda: ControllerTraining(hidden=1), "hidden must be at least 2, got 1"),
+    (lambda: TrainingConfig(held_out=0.9999), r"held_out leaves none of 4000 samples for the fit, got 0\.9999"),
     (
         lambda: train(TrainingConfig((0.0,) * 2, (1.0,) * 2), planar_jacobian, SPEC),
         "lower and upper must name 3 joints, got 2",

@@ -224,6 +224,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("tune", "--controllers", "ukf_mfac", "--robots", "0"), "robots must be"),
     (("train", "--controller", "ukf_mpc"), "controller ukf_mpc has no networks to train"),
     (("train", "--controller", "rbfnn_mfac", "--set", "ukf_mfac.law.gain=1"), "'ukf_mfac' does not run here"),
+    (("train", "--set", f"rbfnn_mfac.training.jacobian.samples={10**15}"), "the memory is not enough: Unable to"),
     (("fmu", "info", "no.fmu"), "no.fmu"),
     (("fmu", "validate", "none.fmu"), "none.fmu"),
     (("fmu", "export", "-o", "new.fmu", "--mismatch", "moderat"), "did you mean 'moderate'?"),
