@@ -138,30 +138,24 @@ ROBOT_WORDS = (
 )
 CAMERA_WORDS = "Your camera: a .toml, a camera_info.yaml of ROS or a file of OpenCV, in place of the bench's."
 SENSING_WORDS = "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand."
-NO_ROBOT = {
-    "claims": "the claims are those of the paper, which are about a UR5",
-    "suite": "challenges are graded on the UR5; compare and sweep take other arms",
-    "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+NO_WORLD = {  # command -> why it has neither --robot nor --camera nor --sensing
+    "claims": "the claims are those of the paper, which are about a UR5 and the ball in 3-D before the bench's camera",
+    "suite": "challenges are graded on the UR5 and the ball in 3-D, with the camera of their files; compare and sweep "
+    "take others",
+    "tune": "methods are tuned on the UR5 alone, by the ball in 3-D before the bench's camera, and others take these "
+    "settings in natural units; compare shows how they do",
 }
 NO_CAMERA = {
-    "claims": "the claims are those of the paper, which are about the bench's camera",
-    "suite": "a challenge names its camera in its file; compare and sweep take any",
-    "analyse": "its loops are those of the ball in 3-D before the bench's camera",
-    "tune": "methods are tuned with the bench's camera, and others take these settings; compare shows how they do",
+    "analyse": "its loops are those of the ball in 3-D before the bench's camera; compare shows how a method does"
 }
 NO_SENSING = {
-    "claims": "the claims are those of the paper, which are about the ball in 3-D",
-    "suite": "challenges are graded on the ball in 3-D; compare and sweep take other sensing",
-    "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
-    "compare shows how they do",
-    "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
     "record": "films show the ball's way through space; figures of run --sensing show pixels",
     "controllers": "settings of a controller are the same under all sensing",
 }
-RobotOption = Annotated[str, named_option("--robot", ROBOT, ROBOT_WORDS, NO_ROBOT)]
+RobotOption = Annotated[str, named_option("--robot", ROBOT, ROBOT_WORDS, NO_WORLD)]
 # Every command that has --robot has --camera, too.
-CameraOption = Annotated[Path | None, named_option("--camera", "FILE", CAMERA_WORDS, NO_CAMERA)]
-SensingOption = Annotated[str, named_option("--sensing", SENSING, SENSING_WORDS, NO_SENSING)]
+CameraOption = Annotated[Path | None, named_option("--camera", "FILE", CAMERA_WORDS, NO_WORLD | NO_CAMERA)]
+SensingOption = Annotated[str, named_option("--sensing", SENSING, SENSING_WORDS, NO_WORLD | NO_CAMERA | NO_SENSING)]
 PlantsOption = Annotated[str, option(PLANT.several(), LISTED.format("plants"))]
 ControllersOption = Annotated[str, option(CONTROLLER.several(), LISTED.format("controllers"))]
 TasksOption = Annotated[str, option(TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")]
@@ -197,20 +191,6 @@ class Combinations:
         ),
     ] = "position"
     seeds: SeedsOption = "1"
-    part: Annotated[
-        str, execution_option("K/N", "Carry out part K of N of the runs only; servobench merge puts parts together.")
-    ] = "1/1"
-
-    def chosen_part(self) -> tuple[int, int]:
-        """Return K and N of --part.
-
-        Raises:
-            ConfigurationError: it does not name one of N parts.
-        """
-        words = self.part.split("/")
-        if len(words) == 2 and all(word.isdecimal() for word in words) and 1 <= int(words[0]) <= int(words[1]):
-            return int(words[0]), int(words[1])
-        raise ConfigurationError(f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}")
 
     def batch(self) -> Batch:
         """Return them as the planner takes them, each name looked up.
@@ -295,26 +275,32 @@ class Running(Place):
 
 
 @dataclass(frozen=True)
-class Judging:
-    """Treatment of runs that fail."""
+class Batched(Running):
+    """Execution of a batch or of a part of it, and treatment of runs that fail."""
 
+    part: Annotated[
+        str, execution_option("K/N", "Carry out part K of N of the runs only; servobench merge puts parts together.")
+    ] = "1/1"
     debug: DebugOption = False
     strict: Annotated[bool, execution_switch("--strict", "End with exit code 1 if a run failed.")] = False
 
-    def execution(self, running: Running) -> Execution:
-        """Return the execution of runs; one by one in this process if they are debugged.
+    def execution(self) -> Execution:
+        """Return it as the driver takes it; runs that are debugged go one by one in this process.
 
         Raises:
-            ConfigurationError: processes or a time limit for runs that are debugged.
+            ConfigurationError: --part does not name one of N parts, or processes or a limit for runs that are debugged.
         """
-        how = running.execution()
+        words = self.part.split("/")
+        if len(words) != 2 or not all(map(str.isdecimal, words)) or not 1 <= int(words[0]) <= int(words[1]):
+            raise ConfigurationError(f"--part names a part of how many, 1/40 to 40/40 for instance, got {self.part!r}")
+        how = replace(super().execution(), part=(int(words[0]), int(words[1])))
         if not self.debug:
             return how
         given = {
-            "--workers": how.workers not in (None, 1),
-            "--scheduler": how.scheduler,
-            "--run-timeout": how.bounds.run_timeout,
-            "--run-memory": how.bounds.run_memory,
+            "--workers": self.workers not in (None, 1),
+            "--scheduler": self.scheduler,
+            "--run-timeout": self.run_timeout,
+            "--run-memory": self.run_memory,
         }
         for option, value in given.items():
             if value:

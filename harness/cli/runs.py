@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -93,12 +92,11 @@ def run(
 def compare(
     *,
     combinations: options.Combinations,
-    running: options.Running,
+    running: options.Batched,
     overrides: options.Overrides,
     out: OutOption = None,
     with_figures: FiguresOption = True,
     with_report: ReportOption = True,
-    judging: options.Judging,
 ) -> None:
     """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
@@ -106,9 +104,8 @@ def compare(
     batch = combinations.batch()
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
-    campaign = comparison(batch, overrides.settings())
-    how = replace(judging.execution(running), part=combinations.chosen_part())
-    _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=judging.strict)
+    campaign, how = comparison(batch, overrides.settings()), running.execution()
+    _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=running.strict)
 
 
 def merge(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -42,9 +41,8 @@ def sweep(
     noise: Annotated[str, option("NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
     latency: Annotated[str, option("SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
     period: Annotated[str, option("SECONDS", "Control periods [s]: --vary period=...")] = "",
-    running: options.Running,
+    running: options.Batched,
     overrides: options.Overrides,
-    judging: options.Judging,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each.
 
@@ -60,15 +58,14 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    how = replace(judging.execution(running), part=combinations.chosen_part())
-    with watching(console, out, how) as how:
+    with watching(console, out, running.execution()) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say_aids(out)
     say(f"table in {out / results.RUNS}")
-    judge(out, results.iterate_runs(out, ("status",)), strict=judging.strict)
+    judge(out, results.iterate_runs(out, ("status",)), strict=running.strict)
 
 
 def robustness(
