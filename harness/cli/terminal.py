@@ -35,11 +35,7 @@ GAP = 2  # [characters] that a table needs for each column beside its cells
 
 
 class Terminal(Console):
-    """A console on which `pixel:hand:` is no emoji, and whose command goes on if nobody reads its output any more."""
-
-    def __init__(self) -> None:
-        """Print to standard output."""
-        super().__init__(emoji=False)
+    """A console whose command goes on if nobody reads its output any more."""
 
     def on_broken_pipe(self) -> None:
         """Print no more; figures and reports are made all the same."""
@@ -49,7 +45,7 @@ class Terminal(Console):
 
 if os.environ.get("COLUMNS", "").strip("0") == "":  # as some programs tell their children: no line would be printed
     os.environ.pop("COLUMNS", None)
-console = Terminal()
+console = Terminal(emoji=False)  # `pixel:hand:` is none
 
 
 @contextlib.contextmanager

@@ -182,36 +182,30 @@ def map_runs(folder: Path) -> pd.DataFrame:
     return runs.assign(moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved))
 
 
-def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | None = None) -> list[Path]:
+def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> list[Path]:
     """Draw success rates and settling times along all axes, as PNG and PDF.
 
     Args:
         runs: the table of the map's runs.
         folder: where; made if needed.
-        limits: predicted limits of the latency by method, see `predicted_limits`; None: they are not drawn.
+        limits: predicted limits of the latency by method, see `predicted_limits`.
 
     Returns:
         The files.
-
-    Raises:
-        ConfigurationError: the table is not that of a map.
     """
-    if "axis" not in runs or not set(runs["axis"]) & set(KNOWN_LINES):
-        raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
     arrived = f"Runs that came within {settling_band(runs)} and stayed"
     took = "Median settling time, from the move where the camera moves"
-    share = _draw(runs, limits or {}, settled_share, arrived, "settled runs [%]", 104.0)
-    time = _draw(runs, limits or {}, settling_median, took, "settling time [s]", 10.0)
+    share = _draw(runs, limits, settled_share, arrived, "settled runs [%]", 104.0)
+    time = _draw(runs, limits, settling_median, took, "settling time [s]", 10.0)
     return style.save_figure(share, folder / "robustness") + style.save_figure(time, folder / "robustness_settling")
 
 
 def settling_median(runs: pd.DataFrame) -> Estimate:
     """Return the median settling time of `runs`, s, with its bootstrap interval; infinite if half never settle.
 
-    Where the table says when the camera was moved, `moved_at_s`, the time counts from there.
+    Where the camera was moved, `moved_at_s`, the time counts from there.
     """
-    begin = runs["moved_at_s"].fillna(0.0) if "moved_at_s" in runs else 0.0
-    return median_with_interval((settling_times(runs) - begin).clip(lower=0.0))
+    return median_with_interval((settling_times(runs) - runs["moved_at_s"].fillna(0.0)).clip(lower=0.0))
 
 
 def _draw(
@@ -238,7 +232,7 @@ def _draw(
             if line.axis == LATENCY and limits:
                 _mark_limits(axes, line, limits, styles)
         style.label_rows(panels, label)
-        arm = runs["robot"].iloc[0] if "robot" in runs else DEFAULT_ROBOT  # folders of 0.1.0 have no such column
+        arm = runs["robot"].iloc[0]
         which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
         notes = [f"{robots} {which}, bands are 95 % intervals"]
         if 0 < len(flat) < len(curves):

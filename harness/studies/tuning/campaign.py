@@ -73,11 +73,6 @@ class TuningPlan:
     study_seed: Periods = 0
     """seed of the first study's sampler; the others count on from it"""
 
-    def __post_init__(self) -> None:
-        """Refuse an unknown controller and one without a search space."""
-        for name in self.controllers:
-            find_tunable(name)
-
 
 @final
 class RunningStudy:
