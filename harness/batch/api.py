@@ -27,6 +27,7 @@ from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
@@ -148,6 +149,10 @@ def compare(
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
         how = Execution(workers, executor, Bounds(run_timeout, run_memory, isolate), resume)
         if not can_travel(offered([*worlds, *names, *batch.tasks])):
+            if how.workers != 1 or how.scheduler or how.bounds != Bounds(isolate=False):
+                remark(
+                    "code of this batch cannot be sent to other processes; its runs stay in this one, without limits"
+                )
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)
 

@@ -14,16 +14,20 @@ from kit.command import judged, python
 from kit.resting import Resting
 from servobench.harness.config.entries import NoSettings
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.settings import remark
 
 SHORT = {"exp1": {"duration": 0.5}}
 
 
-def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
+def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process_and_a_line_says_so(caplog):
     class Local(Resting):
         """As Resting."""
 
-    table = servobench.compare([Local], settings=SHORT, workers=2)
-    assert table["status"].tolist() == ["completed"]
+    remark.cache_clear()
+    for workers in (1, 2):
+        table = servobench.compare([Local], settings=SHORT, workers=workers)
+        assert table["status"].tolist() == ["completed"]
+        assert ("its runs stay in this one, without limits" in caplog.text) == (workers == 2)
 
 
 BELOW_THE_GUARD = """
