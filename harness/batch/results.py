@@ -362,17 +362,30 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a results folder.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema or with a link in it, or a damaged manifest.
+        ConfigurationError: not a results folder, or one with a link in it.
+        OtherSchema: one of another schema.
+        DamagedFile: the manifest was changed, or an entry has another type than it should.
     """
     if os.path.lexists(folder / MANIFEST):
         refuse_links(folder)
     if is_expected(folder, MANIFEST):
         _refuse_damaged(folder, [MANIFEST])
     try:
-        return decode(folder, MANIFEST, (folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         why = f"its {MANIFEST} cannot be read" if folder.exists() else "it does not exist"
         raise ConfigurationError(f"{folder} is not a results folder: {why}") from error
+    version = manifest.get("schema_version") if isinstance(manifest, dict) else None
+    if version != SCHEMA_VERSION:
+        raise OtherSchema(
+            f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
+            f"{CHANGES.get(str(version), '')}; read it with the servobench that wrote it"
+        )
+    for key, types in ENTRIES.items():
+        if key in manifest and not _has_type(manifest[key], *types):
+            wanted, came = " of ".join(WORDS[each] for each in types), str(manifest[key])[:SHOWN]
+            raise DamagedFile(folder, MANIFEST, f"is damaged: {key} must be {wanted}, got {came!r}")
+    return dict(manifest)
 
 
 def is_expected(folder: Path, name: str) -> bool:
@@ -424,36 +437,6 @@ class OtherSchema(ConfigurationError):
 def encode(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as text; JSON has no infinity, so a setting without limit reads "inf"."""
     return json.dumps(plain({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
-
-
-def decode(folder: Path, name: str, text: str) -> dict[str, Any]:
-    """Return the entries of a manifest.
-
-    Args:
-        folder: the results folder, for the message.
-        name: of the file within the folder, likewise.
-        text: of the file.
-
-    Raises:
-        ConfigurationError: not a manifest.
-        OtherSchema: one of another schema.
-        DamagedFile: an entry has another type than it should.
-    """
-    try:
-        manifest = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{folder} is not a results folder: its {name} cannot be read") from error
-    version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if version != SCHEMA_VERSION:
-        raise OtherSchema(
-            f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
-            f"{CHANGES.get(str(version), '')}; read it with the servobench that wrote it"
-        )
-    for key, types in ENTRIES.items():
-        if key in manifest and not _has_type(manifest[key], *types):
-            wanted = " of ".join(WORDS[each] for each in types)
-            raise DamagedFile(folder, name, f"is damaged: {key} must be {wanted}, got {str(manifest[key])[:SHOWN]!r}")
-    return dict(manifest)
 
 
 def _has_type(value: Any, kind: type, inner: type | None = None) -> bool:  # noqa: ANN401 - any JSON
