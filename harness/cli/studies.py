@@ -87,15 +87,15 @@ def robustness(
     The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
     from servobench.harness.batch import results
-    from servobench.harness.batch.plan import parse_seeds
+    from servobench.harness.batch.plan import Batch, parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.robustness import batch_of_map, find_lines, make_map
+    from servobench.harness.studies.robustness import BASE, TASK, find_lines, make_map
 
     settings = overrides.settings()
     lines = find_lines(selection.split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
-    batch = batch_of_map(where, names, parse_seeds(seeds), robot, sensing)
+    batch = Batch((where,), names, (TASK,), (BASE,), parse_seeds(seeds), robot, (sensing,))
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")

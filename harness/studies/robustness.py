@@ -113,19 +113,12 @@ def map_cells(batch: Batch, lines: Sequence[Line] = LINES, moving: Varied = LONG
     return Grid(cell, [Place(line.axis, magnitude) for line in lines for magnitude in line.places], batch.requests())
 
 
-def batch_of_map(
-    plant: str, names: Sequence[str], seeds: Sequence[int], robot: str = DEFAULT_ROBOT, sensing: str = DEFAULT_SENSING
-) -> Batch:
-    """Return the runs at one place of a map: one robot for each seed, all methods, and the axis not varied yet."""
-    return Batch((plant,), tuple(names), (TASK,), (BASE,), seeds, robot, (sensing,))
-
-
 def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines: Sequence[Line] = LINES) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
     Args:
         out: folder of the map.
-        batch: its runs, see `batch_of_map`.
+        batch: its runs at one place, of the task `TASK` with the mismatch `BASE`.
         settings: overrides of the defaults.
         how: how the runs are carried out.
         lines: its axes.

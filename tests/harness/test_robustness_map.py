@@ -1,6 +1,7 @@
 """The robustness map: its cells, its tables, its command."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,15 +12,17 @@ from kit.folders import made_up_row
 from kit.own import WHOLE
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
+from servobench.harness.batch.plan import Batch
 from servobench.harness.config.settings import Settings
 from servobench.harness.studies import robustness
 from servobench.harness.studies.robustness import (
+    BASE,
     KNOWN_LINES,
     LATENCY,
     LINES,
     MOVE,
+    TASK,
     Line,
-    batch_of_map,
     draw_map,
     find_lines,
     map_cells,
@@ -31,9 +34,11 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.mismatch import Magnitude
 
+SMALLEST = Batch(("kinematic",), ("constant",), (TASK,), (BASE,), (0,))
+
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
-    cells = [*map_cells(batch_of_map("kinematic", ["constant", "broyden"], [0, 1, 2]))]
+    cells = [*map_cells(replace(SMALLEST, controllers=("constant", "broyden"), seeds=range(3)))]
     assert len({cell.request.run_id for cell in cells}) == len(cells) == 6 * sum(len(line.places) for line in LINES)
     of = {axis: [each.request for each in cells if each.columns["axis"] == axis] for axis in (MOVE, LATENCY)}
     assert {str(request.mismatch) for request in of[MOVE]} >= {"moderate+camera_move=90deg"}
@@ -44,7 +49,7 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
 def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
     lines = find_lines(["jitter", "outliers"])
     assert [line.axis for line in lines] == ["outliers", "jitter"]
-    requests = [cell.request for cell in map_cells(batch_of_map("kinematic", ["constant"], [0]), lines)]
+    requests = [cell.request for cell in map_cells(SMALLEST, lines)]
     assert {request.varied for request in requests} == {()}
     assert {str(request.mismatch) for request in requests} >= {"moderate+outliers=40%", "moderate+jitter=200ms"}
     assert find_lines([]) is LINES
@@ -150,7 +155,7 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
 
 
 def test_a_map_of_another_arm_and_of_pixels_has_them_at_every_place_and_its_own_prediction():
-    cells = map_cells(batch_of_map("kinematic", ["constant"], [0], "panda", sensing="stereo:hand"))
+    cells = map_cells(replace(SMALLEST, robot="panda", sensings=("stereo:hand",)))
     assert {(cell.request.robot, cell.request.sensing) for cell in cells} == {("panda", "stereo:hand")}
     fast = Settings({"pid+constant": {"law": {"proportional_gain": 9.0}}})
     limits = [predicted_limits(["pid+constant"], fast, robot)["pid+constant"] for robot in ("ur5", "panda")]
