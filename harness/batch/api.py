@@ -15,7 +15,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import can_travel
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
-from servobench.harness.batch.plan import Batch, Cell, Grid
+from servobench.harness.batch.plan import Batch, Cell, Grid, check_seeds
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
 from servobench.harness.config.settings import Settings
@@ -136,8 +136,7 @@ def compare(
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
     chosen = _seeds(seeds)
-    _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
-                 seeds=chosen)  # fmt: skip
+    _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings)
     for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
         if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
             raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
@@ -160,10 +159,10 @@ def compare(
 def _seeds(given: object) -> Sequence[int]:
     """Return the seeds of an argument that counts or lists them."""
     if isinstance(given, SupportsIndex) and not getattr(given, "ndim", 0):  # an array has an index, too
-        return range(operator.index(given))
+        return check_seeds(range(operator.index(given)), f"got {given!r}")
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {given!r}")
-    return tuple(read_seed(each) for each in given)
+    return check_seeds(tuple(map(read_seed, given)), "see the list that was given")
 
 
 def _check_lists(**given: object) -> None:
