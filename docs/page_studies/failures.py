@@ -69,7 +69,8 @@ def tables(folder: Path) -> dict[str, pd.DataFrame]:
 def pictures(folder: Path) -> dict[str, bytes]:
     """Return the picture of the errors at the end."""
     stream = io.BytesIO()
-    exceedance(load_runs(folder / RUNS)).savefig(stream, format="png", dpi=110)
+    with figure_style():
+        exceedance(load_runs(folder / RUNS)).savefig(stream, format="png", dpi=110)
     return {"pictures/final_errors.png": stream.getvalue()}
 
 
@@ -124,22 +125,21 @@ def part_of(title: str) -> str:
 
 def exceedance(runs: pd.DataFrame) -> Figure:
     """Draw which share of the runs has a larger error in the last second."""
-    with figure_style():
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
-        axes = figure.subplots()
-        for method, style in method_styles(runs["controller"].unique()).items():
-            errors = 1e3 * np.sort(runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy())
-            shares = 1.0 - np.arange(len(errors)) / len(errors)
-            axes.plot(errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4)
-        axes.axvline(5.0, color="black", linewidth=0.8, label="settling band, 5 mm")
-        robots, (task,), (plant,) = runs["seed"].nunique(), runs["task"].unique(), runs["plant"].unique()
-        axes.set(
-            title=f"{task} on {plant}, {robots:,} robots", xlabel="error of the last second [mm]", yscale="log",
-            ylabel="share of runs with a larger error",
-        )  # fmt: skip
-        plain_logarithms(axes, "x")
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        return figure
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for method, style in method_styles(runs["controller"].unique()).items():
+        errors = 1e3 * np.sort(runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy())
+        shares = 1.0 - np.arange(len(errors)) / len(errors)
+        axes.plot(errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4)
+    axes.axvline(5.0, color="black", linewidth=0.8, label="settling band, 5 mm")
+    robots, (task,), (plant,) = runs["seed"].nunique(), runs["task"].unique(), runs["plant"].unique()
+    axes.set(
+        title=f"{task} on {plant}, {robots:,} robots", xlabel="error of the last second [mm]", yscale="log",
+        ylabel="share of runs with a larger error",
+    )  # fmt: skip
+    plain_logarithms(axes, "x")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return figure
 
 
 FAILURES = Study(

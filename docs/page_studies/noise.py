@@ -142,7 +142,8 @@ def spread(values: pd.Series) -> str:
 def pictures(setup: SetUp, folder: Path) -> dict[str, bytes]:
     """Return the box plots."""
     stream = io.BytesIO()
-    boxes(ratios(folder)).savefig(stream, format="png", dpi=140)
+    with style.figure_style(style.TEXT):
+        boxes(ratios(folder)).savefig(stream, format="png", dpi=140)
     return {f"pictures/{setup.study}.png": stream.getvalue()}
 
 
@@ -152,17 +153,16 @@ def boxes(runs: Mapping[str, pd.DataFrame]) -> Figure:
     rows = {
         title: {f"{level:g}": own for level, own in runs[family].groupby("level")} for family, title in TITLES.items()
     } | {"white and uniform noise": {family: runs[family] for family in ("white", "uniform")}}
-    with style.figure_style(style.TEXT):
-        figure = Figure(figsize=(style.WIDTH, 8.0), layout="constrained")
-        grid = figure.subplots(len(rows), len(MEASURES), sharey="col")
-        for panels, (title, groups) in zip(grid, rows.items(), strict=True):
-            for axes, measure in zip(panels, MEASURES, strict=True):
-                draw_groups(axes, groups, shown, measure)
-                axes.set_xlabel(title)
-        for axes, measure in zip(grid[0], MEASURES, strict=True):
-            axes.set_title(measure.title)
-        patches = [Patch(color=colour, label=name) for name, colour in shown.items()]
-        figure.legend(handles=patches, loc="outside upper center", ncols=len(patches))
+    figure = Figure(figsize=(style.WIDTH, 8.0), layout="constrained")
+    grid = figure.subplots(len(rows), len(MEASURES), sharey="col")
+    for panels, (title, groups) in zip(grid, rows.items(), strict=True):
+        for axes, measure in zip(panels, MEASURES, strict=True):
+            draw_groups(axes, groups, shown, measure)
+            axes.set_xlabel(title)
+    for axes, measure in zip(grid[0], MEASURES, strict=True):
+        axes.set_title(measure.title)
+    patches = [Patch(color=colour, label=name) for name, colour in shown.items()]
+    figure.legend(handles=patches, loc="outside upper center", ncols=len(patches))
     return figure
 
 

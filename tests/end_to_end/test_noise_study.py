@@ -2,6 +2,7 @@
 
 import io
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
@@ -62,3 +63,5 @@ def test_the_picture_has_a_column_for_each_measure(monkeypatch, tmp_path):
     assert len(content) < 300e3
     with Image.open(io.BytesIO(content)) as picture:
         assert picture.size[0] > 900
+    with mpl.rc_context({"savefig.facecolor": "black"}):  # of the user's
+        assert pictures(POSITION, tmp_path)[name] == content
