@@ -129,10 +129,12 @@ def _of_one_run(runs: pd.DataFrame) -> str:
 def _of_one_controller(runs: pd.DataFrame) -> str:
     sentence = f"`{runs['controller'].iloc[0]}` {asked_of(runs)} in {_share(runs)}"
     moves, _ = split_tasks(runs)
-    if len(moves) == len(runs) and settling_times(runs).notna().any() and len(split_conditions(runs)) == 1:
+    if len(moves) == len(runs) and len(split_conditions(runs)) == 1:
         middle = median_with_interval(settling_times(runs))
-        value, low, high = (number(each, ".2f") for each in (middle.value, middle.low, middle.high))
-        sentence += f", after a median of {value} s (95 % interval: {low} to {high} s)"
+        if math.isfinite(middle.value):  # else half of the runs or more never settled
+            sentence += f", after a median of {middle.value:.2f} s"
+        if math.isfinite(middle.value + middle.low):
+            sentence += f" (95 % interval: {middle.low:.2f} to {number(middle.high, '.2f')} s)"
     return sentence + "."
 
 
@@ -220,7 +222,8 @@ def _clause(places: Sequence[_Standing], count: int) -> str:
 
 def _doubts(runs: pd.DataFrame) -> str:
     """Return how far the order of controllers can be trusted."""
-    seeds, count = runs["seed"].nunique(), runs["controller"].nunique()
+    shared = runs.groupby("seed")["controller"].nunique() > 1  # they differ in an unfinished batch
+    seeds, count = int(shared.sum()), runs["controller"].nunique()
     if seeds < MIN_PAIRS:
         had = "One seed is" if seeds == 1 else f"{seeds} seeds are"
         which = "the two" if count == 2 else f"any two of {count}"

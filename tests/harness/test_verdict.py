@@ -37,6 +37,9 @@ def test_one_controller_is_told_with_intervals():
     assert result.startswith(
         "`mine` settled in 10 of 10 runs (95 % interval: 72 to 100 %), after a median of 1.04 s (95"
     )
+    assert judge(runs_of(1, mine=1.5, calibrated=1.0)).result.endswith("after a median of 1.50 s.")
+    rarely = runs_of(4, mine=np.nan).assign(settling_time_s=[1.0, *3 * [np.nan]])
+    assert judge(rarely).result == "`mine` settled in 1 of 4 runs (95 % interval: 5 to 70 %)."
 
 
 def test_with_few_seeds_the_order_is_a_hint():
@@ -44,6 +47,8 @@ def test_with_few_seeds_the_order_is_a_hint():
     assert verdict.result == "Both controllers settled in every run."
     assert verdict.cautions[0].startswith("5 seeds are too few to tell the two controllers apart")
     assert "at least 6)" in verdict.cautions[0]
+    unfinished = judge(pd.concat([runs_of(8, a=1.0), runs_of(2, b=2.0)]))
+    assert unfinished.cautions[0].startswith("2 seeds are too few")
 
 
 def test_the_first_sentence_names_the_best_and_by_how_much():
