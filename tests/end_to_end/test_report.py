@@ -46,6 +46,11 @@ def test_the_notebook_is_committed_without_outputs():
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in notebook_cells())
 
 
+def test_the_notebook_shows_every_kind_of_figure_of_the_report():
+    calls = re.findall(r"show_pictures\((\".*\")\)", "\n".join("".join(cell["source"]) for cell in notebook_cells()))
+    assert set(", ".join(calls).split(", ")) == {f'"{name}"' for name, kind in report.KINDS.items() if kind.in_page}
+
+
 def small_comparison(folder: Path) -> Path:
     return comparison(folder, CONTROLLERS[:2], ("exp1", "circle"))
 
