@@ -207,9 +207,6 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
 
 def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:
     """Return the first period in which the true feature (k, m) is that of the moved camera at q (k, n)."""
-    before, after = (
-        np.linalg.norm([camera.feature(joints) - seen for joints, seen in zip(q, feature, strict=True)], axis=1)
-        for camera in (model, moved)
-    )
+    before, after = (np.linalg.norm(camera.feature(q) - feature, axis=1) for camera in (model, moved))
     seen = np.flatnonzero(after < before)
     return int(seen[0]) if len(seen) else len(q)
