@@ -26,7 +26,7 @@ def analysed(controller, settings):
 def test_simulated_limits_are_the_predicted_ones():
     predicted, loop, period = analysed("pid+true", {})
     assert abs(loop.latency_limit() - predicted.latency_limit) <= 2.0 * period
-    assert loop.gain_limit() == pytest.approx(predicted.margins.gain, rel=NEAR)
+    assert loop.gain_limit() == pytest.approx(predicted.margins.gain_margin, rel=NEAR)
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_small_motions_die_out_below_the_predicted_limits_and_not_above_them(con
     for periods, stable in ((max(np.ceil(limit) - 2, 0), True), (np.floor(limit) + 3, False)):
         assert loop.is_stable(latency=loop.latency + periods * period) == stable
     for factor, stable in ((1.0 - NEAR, True), (1.0 + NEAR, False)):
-        assert loop.is_stable(factor * predicted.margins.gain) == stable
+        assert loop.is_stable(factor * predicted.margins.gain_margin) == stable

@@ -128,12 +128,12 @@ def test_margins_of_a_single_channel_are_those_of_the_library():
     plant = arm.matrices()
     loop = -control.ss(*controller, PERIOD) * control.ss(plant.A, plant.B, plant.C[:1], plant.D[:1], PERIOD)
     gain, phase, stability, _, crossover, _ = control.stability_margins(loop)
-    assert margins.gain == pytest.approx(gain, rel=2e-3)
-    assert margins.phase == pytest.approx(np.deg2rad(phase), rel=2e-3)
-    assert margins.crossover == pytest.approx(crossover, rel=2e-3)
-    assert margins.delay == pytest.approx(np.deg2rad(phase) / crossover, rel=2e-3)
+    assert margins.gain_margin == pytest.approx(gain, rel=2e-3)
+    assert margins.phase_margin_deg == pytest.approx(phase, rel=2e-3)
+    assert margins.crossover_rad_s == pytest.approx(crossover, rel=2e-3)
+    assert margins.delay_margin_s == pytest.approx(np.deg2rad(phase) / crossover, rel=2e-3)
     assert margins.sensitivity_peak == pytest.approx(1.0 / stability, rel=2e-3)
-    assert margins.disk == pytest.approx(control.disk_margins(loop, frequencies(PERIOD))[0], rel=2e-3)
+    assert margins.disk_margin == pytest.approx(control.disk_margins(loop, frequencies(PERIOD))[0], rel=2e-3)
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.03, 0.1])
@@ -166,8 +166,8 @@ def test_a_frozen_controller_is_identified_as_it_is_linearised():
     linear = linear_controller(warm, "true").response(np.exp(1j * frequency * PERIOD))[:, :, :9]
     np.testing.assert_allclose(identified, linear, atol=2e-3 * np.abs(linear).max())
     margins, wanted = (LoopResponse(frequency, each, warm.arm).margins() for each in (identified, linear))
-    assert margins.delay == pytest.approx(wanted.delay, rel=0.01)
-    assert margins.gain == pytest.approx(wanted.gain, rel=0.01)
+    assert margins.delay_margin_s == pytest.approx(wanted.delay_margin_s, rel=0.01)
+    assert margins.gain_margin == pytest.approx(wanted.gain_margin, rel=0.01)
 
 
 @pytest.mark.slow
@@ -175,7 +175,7 @@ def test_an_identified_loop_has_the_margins_and_the_step_of_the_linearised_one()
     run = resolved("pid+true", law={"integral_gain": 0.7})
     linear, identified = (analyse_loop(run, identify=each) for each in (False, True))
     assert (linear.model, identified.model) == ("linearised", "identified")
-    assert identified.margins.delay == pytest.approx(linear.margins.delay, rel=0.02)
+    assert identified.margins.delay_margin_s == pytest.approx(linear.margins.delay_margin_s, rel=0.02)
     np.testing.assert_allclose(identified.step, linear.step, atol=0.01)
 
 

@@ -12,7 +12,7 @@ feedforward of it does not pass for feedback. Adaptation in the small motions is
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -235,7 +235,7 @@ class LoopAnalysis:
     @property
     def latency_limit(self) -> float:
         """The largest latency of the camera at which the loop is predicted to be stable [s]; 0 if it is not now."""
-        return self.arm.latency + self.margins.delay if self.stable else 0.0
+        return self.arm.latency + self.margins.delay_margin_s if self.stable else 0.0
 
     def gain_limits(self, latencies: Sequence[float]) -> FloatArray:
         """Return the least factor on the command at which the loop becomes unstable, at each latency [s]."""
@@ -357,21 +357,10 @@ def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
     """Return a row for each loop; margins of a loop that is unstable are NaN, its limits 0."""
     rows = []
     for loop in loops:
-        margins, stable = loop.margins, loop.stable
-        numbers = {
-            "gain_margin": margins.gain,
-            "gain_reduction_margin": margins.gain_reduction,
-            "phase_margin_deg": np.rad2deg(margins.phase),
-            "delay_margin_s": margins.delay,
-            "crossover_rad_s": margins.crossover,
-            "sensitivity_peak": margins.sensitivity_peak,
-            "complementary_peak": margins.complementary_peak,
-            "disk_margin": margins.disk,
-            "overshoot": max(0.0, float(loop.step.max()) - 1.0),
-        }
-        known = {name: value if stable else np.nan for name, value in numbers.items()}
+        numbers = asdict(loop.margins) | {"overshoot": max(0.0, float(loop.step.max()) - 1.0)}
+        known = numbers if loop.stable else dict.fromkeys(numbers, np.nan)
         rows.append(
-            {"controller": loop.name, "model": loop.model, "stable": stable, **known,
+            {"controller": loop.name, "model": loop.model, "stable": loop.stable, **known,
              "latency_limit_s": loop.latency_limit}
         )  # fmt: skip
     return pd.DataFrame(rows)

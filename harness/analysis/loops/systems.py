@@ -156,16 +156,16 @@ def split(delay: float, period: float) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class Margins:
-    """The margins of a loop."""
+    """The margins of a loop, by their columns in the table of loops."""
 
-    gain: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
-    gain_reduction: float  # the factor below 1 at which it becomes unstable; 0 if there is none
-    phase: float  # [rad], of all features together; inf where no locus crosses the unit circle
-    delay: float  # additional latency of the camera at which the loop becomes unstable [s]; inf if there is none
-    crossover: float  # largest frequency at which a locus at the feature crosses the unit circle [rad/s]; 0 if none
+    gain_margin: float  # the factor on the command above 1 at which the loop becomes unstable; inf if there is none
+    gain_reduction_margin: float  # the factor below 1 at which it becomes unstable; 0 if there is none
+    phase_margin_deg: float  # of all features together; inf where no locus crosses the unit circle
+    delay_margin_s: float  # additional latency of the camera at which the loop becomes unstable; inf if there is none
+    crossover_rad_s: float  # largest frequency at which a locus at the feature crosses the unit circle; 0 if none
     sensitivity_peak: float  # M_s, at the feature [1]
     complementary_peak: float  # max σ̄(T), at the feature [1]
-    disk: float  # α, at the feature [1]
+    disk_margin: float  # α, at the feature [1]
 
 
 def frequencies(period: float, points: int = POINTS) -> FloatArray:
@@ -216,14 +216,14 @@ class LoopResponse:
         S = sensitivity(self.at_feature())
         every = np.eye(S.shape[-1])
         return Margins(
-            gain=float(gain[gain >= 1.0].min(initial=np.inf)),
-            gain_reduction=float(gain[gain < 1.0].max(initial=0.0)),
-            phase=float(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf)),
-            delay=self.delay_margin(),
-            crossover=float(where.max(initial=0.0)),
+            gain_margin=float(gain[gain >= 1.0].min(initial=np.inf)),
+            gain_reduction_margin=float(gain[gain < 1.0].max(initial=0.0)),
+            phase_margin_deg=float(np.rad2deg(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf))),
+            delay_margin_s=self.delay_margin(),
+            crossover_rad_s=float(where.max(initial=0.0)),
             sensitivity_peak=float(largest_gain(S).max()),
             complementary_peak=float(largest_gain(every - S).max()),
-            disk=1.0 / float(largest_gain(S - every / 2.0).max()),
+            disk_margin=1.0 / float(largest_gain(S - every / 2.0).max()),
         )
 
     def delay_margin(self) -> float:
