@@ -9,17 +9,14 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.controllers.aids import describe_aids
+from servobench.harness.analysis.comparison import shown_value
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
-from servobench.harness.run.request import SECTIONS, varied_columns
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 
-DESCRIBED: Final = {name: name for name in ("plant", "sensing", "controller", "task", "mismatch")} | {
-    "noise_factor": "noise factor",
-    "latency_s": "latency [s]",
-    "period_s": "period [s]",
-}  # column -> heading; settings that are varied, too, have their key
+DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")  # columns, with settings that are varied
 MAX_LISTED: Final = 15  # values of a column
 
 
@@ -32,8 +29,9 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    described = DESCRIBED | {name: name for name in runs.columns if name.startswith(SECTIONS)}
-    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in described.items() if name in runs}
+    described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(runs.columns)
+    for name, (heading, factor) in described.items():
+        facts[heading] = _listed([shown_value(value, factor) for value in runs[name].unique()])
     by = (manifest.get("packages") or {}).get("servobench") or "unknown"
     commit = f", commit {manifest['git_commit']}" if manifest.get("git_commit") else ""
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {by}{commit}"
@@ -75,16 +73,17 @@ def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
     return {"inf": "no limit", "None": "not set"}.get(str(value), str(value))
 
 
-def _listed(values: list[Any]) -> str:
-    words = ["as configured" if pd.isna(value) else str(value) for value in values[:MAX_LISTED]]
-    return ", ".join(words) + (f" and {len(values) - MAX_LISTED} more" if len(values) > MAX_LISTED else "")
+def _listed(values: list[str]) -> str:
+    return ", ".join(values[:MAX_LISTED]) + (
+        f" and {len(values) - MAX_LISTED} more" if len(values) > MAX_LISTED else ""
+    )
 
 
 def _seeds(seeds: list[int]) -> str:
     unique = sorted(set(seeds))
     if len(unique) > 2 and unique[-1] - unique[0] == len(unique) - 1:
         return f"{unique[0]} to {unique[-1]} ({len(unique)})"
-    return _listed(unique)
+    return _listed(list(map(str, unique)))
 
 
 SIGNS: Final = str.maketrans(
@@ -175,7 +174,8 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
 
 def _varied(facts: Mapping[str, str], runs: pd.DataFrame) -> list[str]:
     """Return a sentence with the values of each setting that the runs vary; none if they vary none."""
-    heads = [DESCRIBED.get(name, name) for name in varied_columns(runs.columns) if runs[name].nunique(dropna=False) > 1]
+    columns = varied_columns(runs.columns).items()
+    heads = [heading for name, (heading, _) in columns if runs[name].nunique(dropna=False) > 1]
     return [f"Varied: {'; '.join(f'{head} {facts[head]}' for head in heads)}"] if heads else []
 
 

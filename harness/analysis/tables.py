@@ -58,7 +58,7 @@ from servobench.harness.run.outcome import (
     SETTLED,
     TARGET_UNREACHABLE,
 )
-from servobench.harness.run.request import SECTIONS, SHORT_NAMES, varied_columns
+from servobench.harness.run.request import SHORT_NAMES, varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import TASKS
@@ -66,7 +66,6 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
-TAIL: Final = 0.95
 Row: TypeAlias = "dict[str, Cell]"
 BAND: Final = ("settling_band", "feature_unit")
 SWEEP_COLUMNS: Final = (
@@ -141,7 +140,7 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
             row[heading["settling_time_s"]] = Cell(_median(settling_times(own)), ".2f")
             row[heading["overshoot"]] = Cell(_median(100.0 * column_of(own, "overshoot")), ".1f")
         row[heading[judged]] = Cell(_median(error), ".1f")
-        row[f"its worst 5 % {heading[judged].rpartition(' ')[2]}"] = Cell(tail_mean(error, TAIL), ".1f")
+        row[f"its worst 5 % {heading[judged].rpartition(' ')[2]}"] = Cell(tail_mean(error), ".1f")
         row["failures"] = Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none")
         rows.append(row)
     return rows
@@ -283,13 +282,12 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     """Return how many runs of each condition had which outcome: plant, task, conditions, controller, outcome, runs."""
-    varied = {short.heading: (short.column, short.scale) for short in SHORT_NAMES.values()}
-    varied |= {name: (name, 1.0) for name in runs.columns if name.startswith(SECTIONS)}
+    varied = varied_columns([*SWEEP_COLUMNS, *runs.columns])
     texts = {
-        name: [shown_value(value, scale, MISSING) for value in texts_of(runs, column)]
-        for name, (column, scale) in varied.items()
+        heading: [shown_value(value, factor, MISSING) for value in texts_of(runs, column)]
+        for column, (heading, factor) in varied.items()
     }
-    keys = ["plant", "task", "mismatch", *varied, "controller", "outcome"]
+    keys = ["plant", "task", "mismatch", *texts, "controller", "outcome"]
     named = with_places(runs).assign(outcome=outcomes(runs), **texts)
     return named.groupby(keys, sort=False).size().rename("runs").reset_index()
 

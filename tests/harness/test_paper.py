@@ -60,7 +60,7 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
 
 def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     folder = sweep(tmp_path / "sweep")
-    assert ". Varied: latency [s] 0.0, 0.05. " in methods_paragraph(folder, load_runs(folder))
+    assert ". Varied: latency [ms] 0, 50. " in methods_paragraph(folder, load_runs(folder))
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
