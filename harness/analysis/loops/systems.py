@@ -22,7 +22,6 @@ and, for channels that change each by itself, with S = (I + L)⁻¹ and T = L S,
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -202,24 +201,17 @@ class LoopResponse:
         command = np.linalg.solve(inner, self.controller[:, :, :m])
         return np.asarray(-exposed[:, None, None] * (J @ command))
 
-    @cached_property
-    def _gains(self) -> FloatArray:
-        return gain_crossings(self.at_command())
-
-    @cached_property
-    def _phases(self) -> tuple[FloatArray, FloatArray]:
-        return phase_crossings(self.at_feature(), self.frequency)
-
     def margins(self) -> Margins:
         """Return the margins: of the gain at the command, of the rest at the measured feature."""
-        gain, (phase, where) = self._gains, self._phases
-        S = sensitivity(self.at_feature())
+        gain, L = gain_crossings(self.at_command()), self.at_feature()
+        phase, where = phase_crossings(L, self.frequency)
+        S = sensitivity(L)
         every = np.eye(S.shape[-1])
         return Margins(
             gain_margin=float(gain[gain >= 1.0].min(initial=np.inf)),
             gain_reduction_margin=float(gain[gain < 1.0].max(initial=0.0)),
             phase_margin_deg=float(np.rad2deg(np.minimum(phase, 2.0 * np.pi - phase).min(initial=np.inf))),
-            delay_margin_s=self.delay_margin(),
+            delay_margin_s=float((phase / where).min(initial=np.inf)),
             crossover_rad_s=float(where.max(initial=0.0)),
             sensitivity_peak=float(largest_gain(S).max()),
             complementary_peak=float(largest_gain(every - S).max()),
@@ -228,7 +220,7 @@ class LoopResponse:
 
     def delay_margin(self) -> float:
         """Return the additional latency at which the loop becomes unstable [s], inf if there is none."""
-        phase, where = self._phases
+        phase, where = phase_crossings(self.at_feature(), self.frequency)
         return float((phase / where).min(initial=np.inf))
 
     def gain_limit(self) -> float:
@@ -236,7 +228,7 @@ class LoopResponse:
 
         For a loop that is stable at small gains, whether or not it is at the present one.
         """
-        return float(self._gains.min(initial=np.inf))
+        return float(gain_crossings(self.at_command()).min(initial=np.inf))
 
 
 def sensitivity(L: ComplexArray) -> ComplexArray:
