@@ -231,9 +231,7 @@ def _limit(axes: Axes, values: pd.Series[float], room: float) -> float:
     return edge
 
 
-def draw_places(
-    axes: Axes, places: Sequence[float], values: Mapping[str, Sequence[Estimate]], styles: Mapping[str, MethodStyle]
-) -> None:
+def draw_places(axes: Axes, places: Sequence[float], values: Curves, styles: Styles) -> None:
     """Draw an estimate with its interval for each method at each place (abscissae, ascending), marks shifted sideways.
 
     An infinite estimate is left out, an infinite end of an interval leaves the picture.
@@ -256,9 +254,7 @@ def draw_places(
             )  # fmt: skip
 
 
-def draw_curves(
-    axes: Axes, places: Sequence[float], values: Curves, styles: Mapping[str, MethodStyle], top: float
-) -> None:
+def draw_curves(axes: Axes, places: Sequence[float], values: Curves, styles: Styles, top: float) -> None:
     """Draw an estimate over a quantity, a line a method with its interval as a band; abscissae are to scale.
 
     Methods with the same curve share one line, and the panel names them. An infinite estimate is a mark at the upper
