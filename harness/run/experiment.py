@@ -82,10 +82,6 @@ def draw(resolved: ResolvedRun) -> Drawn:
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
     true, sample, cameras = draw_robot(request)
-    m = len(true.channel.names)
-    if (made := true.feature(np.stack([robot.workspace.home] * 2)).shape) != (2, m):
-        wanted = f"measure must return {m} features along the last axis"
-        raise ConfigurationError(f"sensing {request.sensing}: {wanted}, got the shape {made} for two postures")
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
     return Drawn(build_scenario(resolved, setting), setting, sample, cameras)

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 from annotated_types import Ge
 
+from servobench.harness.config.entries import Guarded
 from servobench.harness.config.source import PLACE, SourceFile
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
@@ -265,7 +266,10 @@ def find_sensing(word: str) -> Sensing:
 def _find(word: str, file: SourceFile | None) -> Sensing:
     place = sensing_place(word)
     found = PLACE.fullmatch(place)
-    own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
+    own = {}
+    if file is not None and found is not None:
+        own[place] = _pick(file, found["file"], found["name"])
+        Guarded(own[place].check)()
     with configuration_errors():
         return Sensing.parse(word, {**SETUPS, **own})
 

@@ -30,12 +30,14 @@ from typing import Final, Literal, Self, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.optics import Optics, in_image, project, project_rates
+from servobench.plant.cameras.optics import Optics, ideal_optics, in_image, project, project_rates
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.sensing import EXTENTS, LENGTH
 from servobench.plant.contract.signals import SETTLING_BAND, BoolArray, Channel
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.hand_eye import RobotModel
 
 Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
@@ -43,17 +45,8 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
 DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
-
-
-def one(focal: float, distance: float) -> float:
-    """Return the natural size of a feature in metres."""
-    del focal, distance
-    return 1.0
-
-
-def pixels_per_metre(focal: float, distance: float) -> float:
-    """Return the motion in the image of a point that moves by a metre parallel to the image plane [px]."""
-    return focal / distance
+POSES: Final = 5  # of the target, at which the functions of a user's set-up are checked
+RATE_TOLERANCE: Final = 1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,8 @@ class SensingSetup:
         measure: makes features of points; pure, over leading axes.
         rates: its derivative along motions of the points; None: by central differences.
         scale: natural size of a feature, in its unit, for a focal length [px] and a working distance [m]: its change
-            with a metre of motion across the optical axis.
+            with a metre of motion across the optical axis; None: a metre in its unit of length, or for "px" f over
+            the distance.
         tolerance: the settling band as a share of the scale, for the norm of the error.
         cameras: c, their number.
         target: p points of the target in a frame whose z axis leads away from the first camera; lengths of a UR5's
@@ -85,7 +79,7 @@ class SensingSetup:
     unit: str
     measure: Measure
     rates: Rates | None = None
-    scale: Callable[[float, float], float] = one
+    scale: Callable[[float, float], float] | None = None
     tolerance: float = SETTLING_BAND
     cameras: int = 1
     target: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
@@ -96,6 +90,9 @@ class SensingSetup:
 
     def __post_init__(self) -> None:
         """Check names and scale."""
+        if self.scale is None and self.unit not in EXTENTS:
+            wanted = "scale=lambda focal, distance: NUMBER, by how much they change with a metre of motion"
+            raise ValueError(f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}")
         self.channel(500.0, 1.0)
 
     @property
@@ -106,15 +103,51 @@ class SensingSetup:
     def channel(self, focal: float, distance: float) -> Channel:
         """Return names, unit and natural size of the features, for a focal length [px] and a `distance` [m]."""
         free = np.full(self.m, np.inf)
-        return Channel(self.features, self.unit, self.scale(focal, distance), -free, free, self.tolerance)
+        return Channel(self.features, self.unit, self.size(focal, distance), -free, free, self.tolerance)
+
+    def size(self, focal: float, distance: float) -> float:
+        """Return the natural size of a feature, in its unit, for a focal length [px] and a `distance` [m]."""
+        if self.scale is not None:
+            return self.scale(focal, distance)
+        return focal / distance if self.unit == "px" else 1.0 / LENGTH[self.unit]
 
     def change(self, points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
         """Return how features of points (..., c, p, 3) change, (..., m, n), with motions (..., c, p, 3, n) [m]."""
-        if self.rates is not None:
-            return self.rates(points, motions, optics)
+        return (self.rates or self._differences)(points, motions, optics)
+
+    def _differences(self, points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
         step = DIFFERENCE * np.moveaxis(motions, -1, 0)
         there, back = self.measure(points + step, optics), self.measure(points - step, optics)
         return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * DIFFERENCE), 0, -1))
+
+    def check(self) -> None:
+        """Refuse functions that break their contract, at a few places of the target in front of the cameras.
+
+        Raises:
+            ConfigurationError: they change their arguments, `measure` does not return m features for each place, or
+                `rates` is not its derivative.
+        """
+        draw, places = np.random.default_rng(0).uniform, (POSES, self.cameras, len(self.target), 3)
+        points = np.array(self.target) + np.array([0.0, 0.0, 1.0]) + draw(-0.05, 0.05, places)
+        optics, motions = ideal_optics(CAMERA, self.cameras), draw(-1.0, 1.0, (*places, 2))
+        given = points.copy(), motions.copy()
+        feature, rates = self.measure(given[0], optics), self.change(*given, optics)
+        if not (np.array_equal(given[0], points) and np.array_equal(given[1], motions)):
+            wanted = "must not change their arguments; work on a copy, such as points.copy()"
+            raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
+        if np.shape(feature) != (POSES, self.m):
+            wanted = f"(..., {self.m}), got {np.shape(feature)} for points {places}; index them as points[..., 0, 0, :]"
+            raise ConfigurationError(f"sensing {self.name}: measure must return features {wanted}")
+        differences = self._differences(points, motions, optics)
+        if np.shape(rates) != differences.shape:
+            wanted = f"(..., {self.m}, n), got {np.shape(rates)} for motions {motions.shape}"
+            raise ConfigurationError(f"sensing {self.name}: rates must return changes {wanted}")
+        wrong = np.abs(rates - differences).max(axis=(0, 2))
+        if (wrong > RATE_TOLERANCE * np.abs(differences).max()).any():
+            raise ConfigurationError(
+                f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
+                f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"
+            )
 
     def valid(self, found: BoolArray) -> BoolArray:
         """Return which features are measured, (..., m), where the points (..., c, p) are found or not."""
@@ -149,7 +182,7 @@ def position_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> F
     return motions[..., 0, 0, :, :]
 
 
-in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, scale=pixels_per_metre, single=True)
+in_pixels = partial(SensingSetup, unit="px", measure=pixels, rates=pixel_rates, single=True)
 """Make a set-up of points in images, the features of which are `pixels`."""
 
 HALF: Final = 0.12  # [m] half side of the plate's square, at the corners of which the discs are
@@ -205,7 +238,7 @@ class SetupModel(RobotModel):
     @property
     def noise_unit(self) -> float:
         """A metre of noise in the unit of the features; pixels have the same noise at every distance."""
-        return self.setup.scale(self.planned.focal, self.far)
+        return self.setup.size(self.planned.focal, self.far)
 
     @property
     def camera(self) -> FloatArray:

@@ -241,9 +241,12 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")
     file.write_text(OWN.replace("axis=-1", "axis=0"))
-    wanted = r"side.py: measure must return 3 features along .*, got the shape \(3, 2\)"
+    wanted = r"sensing side: measure must return features \(\.\.\., 3\), got \(3, 5\)"
     with pytest.raises(ConfigurationError, match=wanted):
         run_experiment(request(str(file)), Settings({}))
+    file.write_text(OWN.replace("np.sqrt", "np.square_root"))
+    with pytest.raises(ConfigurationError, match=r"side.py:8: AttributeError: .* 'square_root'"):
+        find_sensing(str(file))
     with pytest.raises(ConfigurationError, match="defines no sensing set-up"):
         find_sensing(str(write(tmp_path, "x = 1\n", "none.py")))
 

@@ -7,7 +7,6 @@ import pytest
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
 from servobench.plant.cameras.registry import SETUPS
-from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
@@ -178,5 +177,5 @@ def test_a_camera_as_planned_needs_no_lens():
 def test_only_set_ups_whose_features_change_along_a_ray_need_depth():
     wanted = {"position": True, "pixel": False, "stereo": False, "plate": False}
     assert {name: needs_depth(eye, ideal_optics(CAMERA, eye.cameras)) for name, eye in SETUPS.items()} == wanted
-    ratio = SensingSetup("ratio", "", ("a",), "1", lambda points, _: points[..., 0, 0, :1] / points[..., 0, 0, 2:])
+    ratio = replace(SETUPS["pixel"], measure=lambda points, _: points[..., 0, 0, :2] / points[..., 0, 0, 2:])
     assert not needs_depth(ratio, ideal_optics(CAMERA, 1))

@@ -231,6 +231,37 @@ def test_a_plate_needs_six_joints(tmp_path):
         Sensing.parse("plate").nominal(find_robot(str(file)))
 
 
+def in_place(points, optics):
+    points[..., 0] += 1.0
+    return points[..., 0, 0, :2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measure": in_place, "rates": None}, "measure and rates must not change their arguments; work on a copy"),
+        ({"measure": lambda points, _: points[0, 0, :2]}, r"measure must return features \(..., 2\), got \(1, 3\)"),
+        (
+            {"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]},
+            r"rates must return changes \(..., 2, n\), got",
+        ),
+        ({"rates": lambda *given: 1.01 * SETUPS["pixel"].rates(*given)}, "rates is not the derivative of measure"),
+    ],
+)
+def test_functions_that_break_their_contract_are_refused(changes, message):
+    with pytest.raises(ValueError, match=f"sensing pixel: {message}"):
+        replace(SETUPS["pixel"], **changes).check()
+    for setup in SETUPS.values():
+        setup.check()
+
+
+def test_lengths_have_a_natural_size_and_other_units_need_one():
+    for unit, metre in (("mm", 1000.0), ("cm", 100.0), ("m", 1.0)):
+        assert replace(SETUPS["position"], unit=unit).channel(500.0, 2.0).scale == metre
+    with pytest.raises(ValueError, match="sensing position: features in rad need their natural size; give scale="):
+        replace(SETUPS["position"], unit="rad")
+
+
 def test_features_without_a_derivative_are_differentiated():
     exact = SETUPS["pixel"]
     numeric = replace(exact, rates=None)
