@@ -245,6 +245,9 @@ def _assemble(
     with configuration_errors(f"plant {request.plant}: ", RunFault):
         plant = entry.build(resolved.plant, setup)
     try:
+        if true is not None and request.mismatch.size("camera_move") > 0.0:
+            with configuration_errors(f"plant {request.plant}: "):
+                plant.move_camera(true.camera)  # refuses it where it cannot be moved
         if robot is None:
             trained = knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
         else:

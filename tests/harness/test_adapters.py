@@ -56,6 +56,8 @@ def test_a_world_has_the_settings_of_a_bench_and_the_noise_that_they_ask_for(tmp
         last[noise] = (steps["feature_x_m"] - steps["true_feature_x_m"]).std()
     assert last[0.0] == 0.0
     assert 0.003 < last[0.01] < 0.03
+    with pytest.raises(ConfigurationError, match="plant Cell: the plant has no camera that could be moved; leave"):
+        servobench.run("constant", "./cell.py", mismatch="camera_move=30deg", settings=SHORT)
 
 
 def test_settings_of_a_plant_reach_it(tmp_path):
