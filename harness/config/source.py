@@ -1,6 +1,7 @@
 """Python files and modules of users: found, read, executed, sent to other processes; their errors as one line."""
 
 import ast
+import contextlib
 import hashlib
 import importlib
 import importlib.util
@@ -77,7 +78,8 @@ class SourceFile:
         module.__file__, module.__package__ = str(self.path), ""
         sys.modules[name] = module
         try:
-            exec(compile(self.text, str(self.path), "exec"), vars(module))
+            with contextlib.chdir(Path.cwd()):  # a file that changes the folder does so for itself only
+                exec(compile(self.text, str(self.path), "exec"), vars(module))
         except BaseException as error:
             del sys.modules[name]
             if isinstance(error, Exception | SystemExit):
@@ -203,7 +205,8 @@ def import_user_module(module: str) -> ModuleType:
     make_importable(Path.cwd())
     count_as_users(module)
     try:
-        return importlib.import_module(module)
+        with contextlib.chdir(Path.cwd()):
+            return importlib.import_module(module)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(describe_at(error)) from error
 

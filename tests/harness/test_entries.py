@@ -2,6 +2,7 @@
 
 import re
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -48,10 +49,14 @@ def test_a_module_of_the_present_folder_is_found_by_its_name(tmp_path):
     assert choose_controller("own_package_of_a_user.laws:Mine") == "Mine"
 
 
-def test_files_beside_it_can_be_imported(tmp_path):
+def test_files_beside_it_can_be_imported_and_it_changes_no_folder_of_the_command(tmp_path):
     write(tmp_path, "GAIN = 3.0\n", "elsewhere/own_gains_of_a_user.py")
-    write(tmp_path, "from own_gains_of_a_user import GAIN\n" + WHOLE, "elsewhere/mine.py")
+    moves = "import os\nos.chdir('elsewhere')\nopen('own_gains_of_a_user.py').close()\n"
+    write(tmp_path, f"{moves}from own_gains_of_a_user import GAIN\n{WHOLE}", "elsewhere/mine.py")
     assert choose_controller("elsewhere/mine.py") == "Mine"
+    assert Path.cwd() == tmp_path
+    assert choose_controller("other=elsewhere.mine:Mine") == "other"
+    assert Path.cwd() == tmp_path
 
 
 def test_a_class_may_take_settings_and_has_none_otherwise(tmp_path):
