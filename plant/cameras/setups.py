@@ -131,18 +131,16 @@ class SensingSetup:
         points = np.array(self.target) + np.array([0.0, 0.0, 1.0]) + draw(-0.05, 0.05, places)
         optics, motions = ideal_optics(CAMERA, self.cameras), draw(-1.0, 1.0, (*places, 2))
         given = points.copy(), motions.copy()
-        feature, rates = self.measure(given[0], optics), self.change(*given, optics)
+        made = {"measure": self.measure(given[0], optics), "rates": self.change(*given, optics)}
         if not (np.array_equal(given[0], points) and np.array_equal(given[1], motions)):
             wanted = "must not change their arguments; work on a copy, such as points.copy()"
             raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
-        if np.shape(feature) != (POSES, self.m):
-            wanted = f"(..., {self.m}), got {np.shape(feature)} for points {places}; index them as points[..., 0, 0, :]"
-            raise ConfigurationError(f"sensing {self.name}: measure must return features {wanted}")
+        for (name, values), shape in zip(made.items(), ((POSES, self.m), (POSES, self.m, 2)), strict=True):
+            if np.shape(values) != shape:
+                came = f"shape {shape} for points {places}, got {np.shape(values)}; index them as points[..., 0, 0, :]"
+                raise ConfigurationError(f"sensing {self.name}: {name} must return {came}")
         differences = self._differences(points, motions, optics)
-        if np.shape(rates) != differences.shape:
-            wanted = f"(..., {self.m}, n), got {np.shape(rates)} for motions {motions.shape}"
-            raise ConfigurationError(f"sensing {self.name}: rates must return changes {wanted}")
-        wrong = np.abs(rates - differences).max(axis=(0, 2))
+        wrong = np.abs(made["rates"] - differences).max(axis=(0, 2))
         if (wrong > RATE_TOLERANCE * np.abs(differences).max()).any():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "

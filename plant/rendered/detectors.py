@@ -16,7 +16,6 @@ pixels, so that neighbouring depths share their error: the noise is white noise 
 second moment and scaled back to unit variance.
 """
 
-import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -62,6 +61,11 @@ DEPTH, COLOUR = "depth_noise", "colour_noise"  # names of the random streams
 Model = TypeVar("Model", bound=RobotModel)
 Generators: TypeAlias = Mapping[str, np.random.Generator]
 """Random generators by the names of their streams."""
+
+
+def begin_noise(seed: int) -> Generators:
+    """Return the random streams of the noise of images at the start of a run."""
+    return {name: named_generator(seed, name) for name in (DEPTH, COLOUR)}
 
 
 @final
@@ -118,8 +122,6 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
 class DepthCamera:
     """An RGB-D camera that finds the ball in its noisy images; noise is drawn only at pixels of the ball's colour."""
 
-    streams = (DEPTH, COLOUR)
-
     def __init__(self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float) -> None:
         """Take a scene and the radius of its ball [m]."""
         self.camera, self.radius = camera, radius
@@ -157,31 +159,14 @@ class DepthCamera:
 
 
 class Detector(ABC, Generic[Model]):
-    """Measures features in rendered images, with random streams for the noise of the images.
+    """Measures features in rendered images.
 
     The methods take `model`, the true arm and cameras, and `q`, (n,) rad, the exact joint positions of the scene.
     """
 
-    def __init__(self, streams: tuple[str, ...]) -> None:
-        """Take the names of the random streams; `reset` begins them."""
-        self._streams = streams
-        self.noise: Generators = {}
-
-    def reset(self, seed: int) -> None:
-        """Draw all randomness from `seed`."""
-        self.noise = {name: named_generator(seed, name) for name in self._streams}
-
-    def save(self) -> Generators:
-        """Return the state of the noise, as a value."""
-        return copy.deepcopy(self.noise)
-
-    def restore(self, state: Generators) -> None:
-        """Return to a state of the noise."""
-        self.noise = copy.deepcopy(state)
-
     @abstractmethod
-    def measure(self, model: Model, q: FloatArray) -> tuple[FloatArray | None, BoolArray | None]:
-        """Return the measured features, (m,), and which are valid, (m,).
+    def measure(self, model: Model, q: FloatArray, noise: Generators) -> tuple[FloatArray | None, BoolArray | None]:
+        """Return the features as measured with the noise of images, (m,), and which are valid, (m,).
 
         No features mean that nothing was found, no mask that all features are valid.
         """
@@ -206,12 +191,11 @@ class BallDetector(Detector[HandEyeModel]):
     def __init__(self, scene: Scene, config: RenderedConfig, robot: Robot) -> None:
         """Take a scene with a ball on the flange of a robot."""
         camera, ball_radius = CAMERA.reaching(robot.workspace.camera_distance), robot.workspace.ball_radius
-        super().__init__(DepthCamera.streams)
         self._scene, self._camera = scene, DepthCamera(scene, config, camera, ball_radius)
 
-    def measure(self, model: HandEyeModel, q: FloatArray) -> tuple[FloatArray | None, None]:
+    def measure(self, model: HandEyeModel, q: FloatArray, noise: Generators) -> tuple[FloatArray | None, None]:
         """Return the ball's centre as fitted to the depths, (3,) m, or None."""
-        found = self._camera.find(model.X_BC, self._scene.ball_position(), self.noise)
+        found = self._camera.find(model.X_BC, self._scene.ball_position(), noise)
         if found is None:
             return None, None
         found.centre.setflags(write=False)
@@ -239,8 +223,6 @@ class BallDetector(Detector[HandEyeModel]):
 @final
 class MarkCameras:
     """Cameras without depth, in whose images marks are found."""
-
-    streams = (COLOUR,)
 
     def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig) -> None:
         """Take a scene with the target of a set-up."""
@@ -287,8 +269,6 @@ class MarkCameras:
 class BallCameras:
     """Cameras with depth, which fit a sphere to the ball."""
 
-    streams = DepthCamera.streams
-
     def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
         """Take a scene with a ball.
 
@@ -321,12 +301,11 @@ class SetupDetector(Detector[SetupModel]):
 
     def __init__(self, cameras: MarkCameras | BallCameras) -> None:
         """Take the cameras."""
-        super().__init__(cameras.streams)
         self._cameras = cameras
 
-    def measure(self, model: SetupModel, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def measure(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
         """See `Detector.measure`."""
-        points, found = self._cameras.find(model, q, self.noise)
+        points, found = self._cameras.find(model, q, noise)
         feature = model.setup.measure(points, model.optics)
         feature.setflags(write=False)
         return feature, model.setup.valid(found)

@@ -6,11 +6,10 @@ import pytest
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.contract.faults import FeatureLost
-from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import detectors
 from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
-from servobench.plant.rendered.detectors import DepthCamera, measure_depth
+from servobench.plant.rendered.detectors import DepthCamera, begin_noise, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.workspace import BALL_RADIUS
@@ -121,7 +120,7 @@ def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_bal
 def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeypatch):
     scene, camera, found = open_scene(scenery=False), PinholeCamera(), 0
     depth_camera = DepthCamera(scene, BARE, camera, BALL_RADIUS)
-    noise, again = ({name: named_generator(3, name) for name in depth_camera.streams} for _ in range(2))
+    noise, again = begin_noise(3), begin_noise(3)
     for X_BC, _ in poses(scene, depth_camera, 30):
         one = depth_camera.find(X_BC, scene.ball_position(), noise)
         with monkeypatch.context() as patched:

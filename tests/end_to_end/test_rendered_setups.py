@@ -15,7 +15,7 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.detectors import open_detector
+from servobench.plant.rendered.detectors import begin_noise, open_detector
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
@@ -51,7 +51,7 @@ def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_
     model, rng = true_model(word), np.random.default_rng(5)
     scene = scene_of(engine)(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
-    detector.reset(0)
+    noise = begin_noise(0)
     while poses < 8:
         q = rng.uniform(UR5.workspace.lower, UR5.workspace.upper)
         true, _, in_view = model.observe(q)
@@ -59,7 +59,7 @@ def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_
             continue
         poses += 1
         scene.place(model.arm.joint_angle(q))
-        found, seen = detector.measure(model, q)
+        found, seen = detector.measure(model, q, noise)
         errors += [np.linalg.norm(each) for each in (found - true)[seen].reshape(-1, 2)]
     scene.close()
     assert len(errors) > 0.6 * poses * model.setup.m / 2

@@ -240,11 +240,11 @@ def in_place(points, optics):
     ("changes", "message"),
     [
         ({"measure": in_place, "rates": None}, "measure and rates must not change their arguments; work on a copy"),
-        ({"measure": lambda points, _: points[0, 0, :2]}, r"measure must return features \(..., 2\), got \(1, 3\)"),
         (
-            {"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]},
-            r"rates must return changes \(..., 2, n\), got",
+            {"measure": lambda points, _: points[0, 0, :2]},
+            r"measure must return shape \(5, 2\) for points \(5, 1, 1, 3\), got \(1, 3\)",
         ),
+        ({"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]}, r"rates must return shape \(5, 2, 2\) for"),
         ({"rates": lambda *given: 1.01 * SETUPS["pixel"].rates(*given)}, "rates is not the derivative of measure"),
     ],
 )
