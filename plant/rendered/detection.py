@@ -11,6 +11,7 @@ where that slope grows without bound, and pixels whose residual stands far off t
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -101,31 +102,29 @@ def largest_patch(mask: ByteArray) -> Patch | None:
 
 
 def add_colour_noise(
-    rgb: ByteArray, deviation: float, generator: np.random.Generator, colour: HueRange = RED_RANGE
+    rgb: ByteArray, deviation: float, generator: np.random.Generator, colours: Iterable[HueRange] = (RED_RANGE,)
 ) -> ByteArray:
-    """Return an image with white noise on each channel around all of a colour; nothing is drawn elsewhere.
+    """Return an image with white noise on each channel around all of each colour; nothing is drawn elsewhere.
 
-    Noise gives pixels of other things this colour by chance, but never as many together as the mark's, so only the box
-    around the pixels that have it without noise matters.
+    Noise gives pixels of other things a colour by chance, but never as many together as the mark's, so only the boxes
+    around the pixels that have it without noise matter.
 
     Args:
         rgb: (h, w, 3 or 4).
         deviation: standard deviation of the noise, of 255.
         generator: of the noise.
-        colour: around which there is noise; red by default.
-
-    Returns:
-        A new image, or `rgb` itself where nothing has the colour.
+        colours: around which there is noise; red by default.
     """
-    x, y, width, height = cv2.boundingRect(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *colour))
-    if width * height < MIN_PIXELS:
-        return rgb
-    rows = slice(max(0, y - COLOUR_MARGIN), y + height + COLOUR_MARGIN)
-    columns = slice(max(0, x - COLOUR_MARGIN), x + width + COLOUR_MARGIN)
-    noisy = rgb.copy()
-    box = noisy[rows, columns, :3]
-    values = box + deviation * generator.standard_normal(box.shape)
-    noisy[rows, columns, :3] = np.clip(np.round(values), 0, 255).astype(np.uint8)
+    hsv, noisy = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), rgb.copy()
+    for colour in colours:
+        x, y, width, height = cv2.boundingRect(cv2.inRange(hsv, *colour))
+        if width * height < MIN_PIXELS:
+            continue
+        rows = slice(max(0, y - COLOUR_MARGIN), y + height + COLOUR_MARGIN)
+        columns = slice(max(0, x - COLOUR_MARGIN), x + width + COLOUR_MARGIN)
+        box = rgb[rows, columns, :3]
+        values = box + deviation * generator.standard_normal(box.shape)
+        noisy[rows, columns, :3] = np.clip(np.round(values), 0, 255).astype(np.uint8)
     return noisy
 
 

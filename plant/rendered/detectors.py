@@ -234,7 +234,10 @@ class MarkCameras:
 
     def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
         """Return the points in the frame of each camera, (c, p, 3) m at a depth of 1 m, and which are found, (c, p)."""
-        found, pixels = self._find([self._noisy(image, noise) for image in self._images(model, q)])
+        images, hues = self._images(model, q), [colour.hues for colour in self._colours]
+        if self._deviation > 0.0:
+            images = [add_colour_noise(image, self._deviation, noise[COLOUR], hues) for image in images]
+        found, pixels = self._find(images)
         points = locate(pixels, np.ones(found.shape), model.optics)
         points[~found] = NOWHERE
         return points, found
@@ -250,12 +253,6 @@ class MarkCameras:
     def _images(self, model: SetupModel, q: FloatArray) -> list[ByteArray]:
         poses = camera_poses(model, q)
         return [lens.render(self._scene, pose) for lens, pose in zip(self._lenses, poses, strict=True)]
-
-    def _noisy(self, image: ByteArray, noise: Generators) -> ByteArray:
-        """Return an image with colour noise around each mark."""
-        for colour in self._colours if self._deviation > 0.0 else ():
-            image = add_colour_noise(image, self._deviation, noise[COLOUR], colour.hues)
-        return image
 
     def _find(self, images: list[ByteArray]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""

@@ -170,7 +170,7 @@ def test_colour_noise_changes_the_surroundings_of_the_ball_only_and_by_its_devia
     quiet, loud = (detect(image, depth).centre for image in (rgb, noisy))
     assert np.linalg.norm(quiet - loud) < 0.001
     blank = np.zeros_like(rgb)
-    assert add_colour_noise(blank, 5.0, np.random.default_rng(0)) is blank
+    np.testing.assert_array_equal(add_colour_noise(blank, 5.0, np.random.default_rng(0)), blank)
 
 
 def test_stereo_noise_follows_the_white_paper():

@@ -7,6 +7,7 @@ import pytest
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
 from servobench.plant.cameras.registry import SETUPS
+from servobench.plant.rendered.detection import add_colour_noise
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
@@ -163,6 +164,15 @@ def test_a_lens_shows_a_point_where_its_optics_project_it(camera, optics, centre
     (mark,) = find_marks(image, MARK_COLOURS[1:2])
     true = project(np.array(centre)[None, None], optics)[0, 0]
     assert np.linalg.norm(disc_centre(mark, camera) - true) < 0.2
+
+
+def test_noise_around_a_mark_brings_no_more_of_it_around_another():
+    image, hues = blank(), [colour.hues for colour in MARK_COLOURS]
+    for mark in range(4):
+        image[115:125, 55 + 60 * mark : 65 + 60 * mark] = paint(mark)
+    changed = (add_colour_noise(image, 50.0, np.random.default_rng(0), hues) != image).any(axis=-1)
+    assert 1200 < changed.sum() <= 4 * 18**2  # boxes of 10 px with a margin of 4 px
+    assert not changed[:, [90, 150, 210]].any()
 
 
 def test_a_camera_as_planned_needs_no_lens():
