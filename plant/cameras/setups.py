@@ -93,6 +93,10 @@ class SensingSetup:
         if self.scale is None and self.unit not in EXTENTS:
             wanted = "scale=lambda focal, distance: NUMBER, by how much they change with a metre of motion"
             raise ValueError(f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}")
+        if self.single and self.m % (count := self.cameras * len(self.target)):
+            raise ValueError(
+                f"sensing {self.name}: single needs as many features for each of {count} points, got {self.m}"
+            )
         self.channel(500.0, 1.0)
 
     @property

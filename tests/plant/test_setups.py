@@ -255,11 +255,13 @@ def test_functions_that_break_their_contract_are_refused(changes, message):
         setup.check()
 
 
-def test_lengths_have_a_natural_size_and_other_units_need_one():
+def test_lengths_have_a_natural_size_and_other_units_need_one_and_single_features_a_point():
     for unit, metre in (("mm", 1000.0), ("cm", 100.0), ("m", 1.0)):
         assert replace(SETUPS["position"], unit=unit).channel(500.0, 2.0).scale == metre
     with pytest.raises(ValueError, match="sensing position: features in rad need their natural size; give scale="):
         replace(SETUPS["position"], unit="rad")
+    with pytest.raises(ValueError, match="sensing stereo: single needs as many features for each of 2 points, got 3"):
+        replace(SETUPS["stereo"], features=("u1", "v1", "u2"))
 
 
 def test_features_without_a_derivative_are_differentiated():
