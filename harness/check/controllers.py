@@ -12,7 +12,7 @@ from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.methods import with_aids
 from servobench.controllers.servo import Servo, ServoState
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, report
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, is_refusal, naming, report
 from servobench.harness.check.rig import PERIOD, PREVIEW, Conditions, Driver, Rig, attributes, differing, watching_draws
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
@@ -207,18 +207,15 @@ class ControllerChecks:
         """It takes its sizes from `knowledge.spec`."""
         n, m = OTHER_SIZES
         what = f"{n} joints and {m} features"
-        try:
-            knowledge = Rig(n, m).knowledge(truth=self.entry.needs_truth)
-            controller = self.entry.build(default_config(self.entry), knowledge)
-        except ValueError as error:
-            if isinstance(error, ConfigurationError) and "ValueError" not in str(error):
-                raise CheckFailed(f"{error}; this happens with {what}: take n and m from knowledge.spec") from error
-            return f"it refuses {what}: {error}"
-        try:
+        with naming(f"{what}: take n and m from knowledge.spec"):
+            try:
+                knowledge = Rig(n, m).knowledge(truth=self.entry.needs_truth)
+                controller = self.entry.build(default_config(self.entry), knowledge)
+            except ValueError as error:
+                if is_refusal(error):
+                    return f"it refuses {what}: {error}"
+                raise
             Driver(controller, Rig(n, m)).begin().run(min(self.steps, 6))
-        except Exception as error:
-            error.args = (f"{error}; this happens with {what}: take n and m from knowledge.spec",)
-            raise
         return None
 
     def no_preview(self) -> str | None:

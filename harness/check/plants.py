@@ -6,19 +6,29 @@ from typing import Final
 
 import numpy as np
 
-from servobench.harness.check.report import Check, CheckFailed, Finding, Report, report
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, is_refusal, naming, report
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.harness.run.contract import HeldPlant
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
-from servobench.plant.contract.signals import Command, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME
 
 PERIOD: Final = 0.05  # [s]
+OTHER: Final = "panda", 0.1  # a second robot, and its period [s]
 MISMATCH: Final = "moderate+gear_ratio=5%"
 STEPS: Final = 6
 SHARE: Final = 0.5  # of the joint-speed limits, within which commands are drawn
+MOTION: Final = (0.05, 0.1)  # [rad] by which the first and the last joint are moved, those between by lengths between
+MOTION_TIME, REST_TIME = 0.5, 1.0  # [s] of such a motion, and of the rest after it, longer than usual delays
+TURN: Final = 0.3  # [rad] of the first joint at the start, so that no feature of the two robots is near zero
+START_TOLERANCE: Final = 0.01  # [rad]
+FOLLOWING: Final = (0.6, 1.6)  # a motion over the commanded one
+SAMPLES: Final = 5  # last features at rest, whose median has little noise and no outliers
+FEATURE_TOLERANCE: Final = 0.05  # of the feature, or of its natural size if that is larger
+NOMINAL_SHARE: Final = 0.2  # of the distance from the true model, within which a plant is that of the nominal model
+CLIPPED_STEPS: Final = 4  # more than a usual command delay
 JACOBIAN_STEPS: Final = 4  # of a slow motion that the true Jacobian has to predict
 JACOBIAN_TOLERANCE: Final = 0.05  # of the motion of the feature
 MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
@@ -55,11 +65,17 @@ class PlantChecks:
 
     def __init__(self, entry: PlantEntry) -> None:
         """Prepare the checks."""
-        self.entry, self._plant = entry, list[Plant]()
+        self.entry, self._plants = entry, list[tuple[Plant, PlantSetup]]()
+        self._at_rest: list[tuple[FloatArray, FloatArray, Truth]] = []  # what `_drive` returned for each plant
+        self._second = f"a period of {1e3 * OTHER[1]:g} ms" + ("" if entry.own_robot else f" and the robot {OTHER[0]}")
+
+    @property
+    def _plant(self) -> Plant:
+        return self._plants[0][0]
 
     def close(self) -> None:
         """Close the plant."""
-        for plant in self._plant:
+        for plant, _ in self._plants:
             with contextlib.suppress(Exception):  # the check of it has reported it
                 plant.close()
 
@@ -78,23 +94,27 @@ class PlantChecks:
             Check("close", self.closing, run),
         ]
 
-    def build(self) -> None:
-        """It can be built."""
-        self._plant.append(self._build())
+    def build(self) -> str | None:
+        """It can be built, with a second robot and control period, too."""
+        self._plants.append(self._build())
+        try:
+            with naming(self._second):
+                self._plants.append(self._build(*OTHER))
+        except ValueError as error:
+            if not is_refusal(error):
+                raise
+            return f"not checked: {error}"
+        return None
 
     def run(self) -> None:
-        """Time counts control periods, and observations have the sizes of the spec."""
-        plant = self._plant[0]
-        spec = plant.spec
-        if spec.period != PERIOD:
-            raise CheckFailed(f"spec.period must be the period of the setup, {PERIOD:g} s, got {spec.period:g} s")
-        for k, observation in enumerate(self._observe(HeldPlant(plant), 0)):
-            if abs(observation.time - k * PERIOD) > 1e-12:
-                raise CheckFailed(f"after {k} steps time must be {k * PERIOD:g} s, got {observation.time!r}")
+        """Time counts control periods, observations have the sizes of the spec, and joints follow their commands."""
+        for (plant, setup), what in zip(self._plants, ("", self._second), strict=False):
+            with naming(what):
+                self._at_rest.append(_drive(HeldPlant(plant), setup))
 
     def repeatable(self) -> None:
         """The same seed gives the same bits."""
-        first, again = ([_bits(each) for each in self._observe(self._plant[0], 7)] for _ in range(2))
+        first, again = ([_bits(each) for each in self._observe(self._plant, 7)] for _ in range(2))
         if first != again:
             raise CheckFailed(
                 "reset with the same seed gives another run: draw all randomness from it and keep nothing"
@@ -102,10 +122,10 @@ class PlantChecks:
 
     def clipping(self) -> None:
         """A command beyond the limits is clipped."""
-        plant, moves = self._plant[0], []
+        plant, moves = self._plant, []
         for factor in (1.0, 10.0):
             plant.reset(0)
-            for _ in range(2):
+            for _ in range(CLIPPED_STEPS):
                 observation = plant.step(Command(factor * plant.spec.joint_velocity_limit))
             moves.append(observation.joint_position)
         if not np.allclose(moves[0], moves[1], atol=1e-9):
@@ -113,7 +133,7 @@ class PlantChecks:
 
     def wrong_size(self) -> None:
         """A command of the wrong size is refused."""
-        plant = self._plant[0]
+        plant = self._plant
         plant.reset(0)
         with contextlib.suppress(ValueError):
             plant.step(Command(np.zeros(plant.spec.n + 1)))
@@ -122,12 +142,15 @@ class PlantChecks:
     def negative_seed(self) -> None:
         """A negative seed is refused."""
         with contextlib.suppress(ValueError):
-            self._plant[0].reset(-1)
+            self._plant.reset(-1)
             raise CheckFailed("reset must refuse the seed -1 by a ValueError")
 
     def truth(self) -> str | None:
-        """The true Jacobian predicts how the true feature moves."""
-        plant = self._plant[0]
+        """The true feature is what is measured and what the model says, and its Jacobian predicts how it moves."""
+        for (plant, setup), at_rest, what in zip(self._plants, self._at_rest, ("", self._second), strict=False):
+            with naming(what):
+                _compare(plant.spec, setup, *at_rest)
+        plant = self._plant
         start = plant.reset(0).joint_position
         before = HeldPlant(plant).truth()
         for _ in range(JACOBIAN_STEPS):
@@ -140,13 +163,13 @@ class PlantChecks:
         size = float(np.linalg.norm(moved))
         if size < MIN_MOTION * plant.spec.feature.scale:
             return "the feature hardly moves at the start, so the true Jacobian cannot be judged"
-        if wrong > JACOBIAN_TOLERANCE * size:
+        if not wrong <= JACOBIAN_TOLERANCE * size:
             raise CheckFailed(f"truth().jacobian misses {wrong / size:.0%} of a small motion of truth().feature")
         return None
 
     def save(self) -> str | None:
         """A restored state continues with the same bits."""
-        plant = self._plant[0]
+        plant = self._plant
         plant.reset(5)
         try:
             state = plant.save()
@@ -160,18 +183,21 @@ class PlantChecks:
 
     def closing(self) -> None:
         """Closing twice is allowed and closes no other plant."""
-        other = self._build()
+        other, _ = self._build()
         other.close()
         other.close()
-        self._plant[0].reset(0)
+        self._plant.reset(0)
 
-    def _build(self) -> Plant:
+    def _build(self, name: str = "ur5", period: float = PERIOD) -> tuple[Plant, PlantSetup]:
         if self.entry.own_robot:
-            return self.entry.build(self.entry.config(), PlantSetup(None, None, PERIOD))
-        robot = find_robot("ur5")
+            setup = PlantSetup(None, None, period)
+            return self.entry.build(self.entry.config(), setup), setup
+        robot = find_robot(name)
         model, _ = sample_mismatch(Mismatch.parse(MISMATCH), robot, 1)
+        start = np.array([TURN, *np.zeros(robot.n - 1)]) + robot.workspace.home
+        setup = PlantSetup(model, start, period, robot)
         config = self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
-        return self.entry.build(config, PlantSetup(model, np.array(HOME), PERIOD, robot))
+        return self.entry.build(config, setup), setup
 
     def _commands(self, plant: Plant) -> list[Command]:
         drawn = np.random.default_rng(2).uniform(-SHARE, SHARE, (STEPS, plant.spec.n))
@@ -183,3 +209,49 @@ class PlantChecks:
 
 def _bits(observation: Observation) -> tuple[bytes, bytes, bool]:
     return observation.joint_position.tobytes(), observation.feature.tobytes(), bool(observation.feature_valid)
+
+
+def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Truth]:
+    """Move all joints, and return joint positions, measured feature and truth at rest after it."""
+    spec, period, start = plant.spec, setup.period, setup.start
+    if spec.period != period:
+        raise CheckFailed(f"spec.period must be the period of the setup, {period:g} s, got {spec.period:g} s")
+    if start is not None and spec.n != len(start):
+        raise CheckFailed(f"spec has {spec.n} joints and the start {len(start)}: take their number from setup.robot()")
+    first = plant.reset(0).joint_position
+    if start is not None and not np.abs(first - start).max() <= START_TOLERANCE:
+        raise CheckFailed(f"reset must begin at setup.start, {start.round(3).tolist()} rad, got {first.tolist()}")
+    inwards = np.where(first < (spec.joint_lower + spec.joint_upper) / 2.0, 1.0, -1.0)
+    wanted = inwards * np.minimum(np.linspace(*MOTION, spec.n), SHARE * MOTION_TIME * spec.joint_velocity_limit)
+    moving, resting = round(MOTION_TIME / period), round(REST_TIME / period)
+    commands = [Command(wanted / MOTION_TIME)] * moving + [Command(np.zeros(spec.n))] * resting
+    seen = [plant.reset(0), *map(plant.step, commands)]
+    for k, observation in enumerate(seen):
+        if abs(observation.time - k * period) > 1e-12:
+            raise CheckFailed(f"after {k} steps time must be {k * period:g} s, got {observation.time!r}")
+    joints = seen[-1].joint_position
+    least, most = FOLLOWING
+    for name, moved, asked in zip(spec.joint_names, joints - first, wanted, strict=True):
+        if not least <= moved / asked <= most:
+            raise CheckFailed(
+                f"{name} moves by {moved:.3g} rad under commands for {asked:.3g} rad: commands are in rad/s, in the "
+                f"order of spec.joint_names, and held for a period, {period:g} s; positions are in rad"
+            )
+    return joints, np.median([each.feature for each in seen[-SAMPLES:]], axis=0), plant.truth()
+
+
+def _compare(spec: PlantSpec, setup: PlantSetup, joints: FloatArray, seen: FloatArray, truth: Truth) -> None:
+    """Hold the true feature at rest against the measured one and that of the robot that the plant was given."""
+    unit, true = spec.feature_unit, truth.feature
+    tolerance = FEATURE_TOLERANCE * max(spec.feature.scale, float(np.linalg.norm(true)))
+    said = f"at rest truth().feature is {true.round(4).tolist()} {unit}"
+    if not np.linalg.norm(seen - true) <= tolerance:
+        remedy = "both are of one camera, in one order and unit"
+        raise CheckFailed(f"{said}, and the measured feature {seen.round(4).tolist()} {unit}; {remedy}")
+    if setup.model is None or setup.nominal is None:
+        return
+    model, nominal = (each.feature(joints) for each in (setup.model, setup.nominal.nominal))
+    wrong = np.linalg.norm(true - model)
+    if wrong > tolerance or np.linalg.norm(true - nominal) < NOMINAL_SHARE * wrong:
+        remedy = "the plant has to be the robot and camera that setup.robot() returns, mismatch included"
+        raise CheckFailed(f"{said}, and that of setup.model {model.round(4).tolist()} {unit}; {remedy}")

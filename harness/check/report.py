@@ -1,7 +1,8 @@
 """Findings of checks: each ok, failed or a note."""
 
+import contextlib
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 
 from servobench.harness.config.source import describe_at, show
 from servobench.harness.run.result import WrongAnswer
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
 WIDTH: Final = 14  # of the names of checks, in print
@@ -57,6 +58,22 @@ class Report:
 
 class CheckFailed(Exception):
     """A check found a defect; the message names the remedy."""
+
+
+@contextlib.contextmanager
+def naming(conditions: str) -> Iterator[None]:
+    """Name the conditions under which code failed at the end of its error; nothing for those that are usual."""
+    try:
+        yield
+    except Exception as error:
+        if conditions:
+            error.args = (f"{error}; this happens with {conditions}",)
+        raise
+
+
+def is_refusal(error: ValueError) -> bool:
+    """Return whether code refused its arguments, and did not fail otherwise, such as by an index out of range."""
+    return isinstance(error.__cause__, ValueError | RunFault | None)
 
 
 class Check(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 import servobench
 from kit.broken_controllers import BROKEN, NOTED, stepping
 from kit.command import python
-from kit.own import CONFIGURED, WHOLE, write
+from kit.own import CELL, CONFIGURED, WHOLE, write
 from servobench.harness.check.controllers import check_controller
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.signals import Command
@@ -150,7 +150,7 @@ def plant_with(**methods) -> PlantEntry:
         ({"reset": lambda own, seed: own(seed + (seed >= 0) * next(COUNT))}, "repeatable",
          "reset with the same seed gives another run"),
         ({"reset": lambda own, seed: own(abs(seed))}, "negative seed", "reset must refuse the seed -1"),
-        ({"step": lambda own, u: own(Command(u.joint_velocity[:6]))}, "wrong size",
+        ({"step": lambda own, u: own(Command(u.joint_velocity[:own.__self__.spec.n]))}, "wrong size",
          "step must refuse 7 joint velocities"),
         ({"truth": lambda own: replace(own(), jacobian=2 * own().jacobian)}, "truth", "truth().jacobian misses "),
         ({"save": lambda own: None, "restore": lambda own, state: None}, "save",
@@ -162,6 +162,42 @@ def test_a_broken_plant_fails_one_check_with_one_line(methods, check, line):
     report = servobench.check_plant(plant_with(**methods))
     assert [each.check for each in report.failures] == [check], report
     assert line in report.failures[0].text
+
+
+MOVING, SEEN = "self.spec.period * joint_velocity", "return self.model.feature(self.q)\n\n"
+OTHER = "; this happens with a period of 100 ms and the robot panda"
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "line"),
+    [
+        ("self.q = self.start", "self.q = np.degrees(self.start)", "run: reset must begin at setup.start, [0.65"),
+        (MOVING, f"np.radians({MOVING})", "run: q0 moves by -0.000873 rad under commands for -0.05 rad: commands"),
+        (MOVING, f"{MOVING} * (np.arange(len(self.q)) != 3)", "run: q3 moves by 0 rad under"),
+        (MOVING, f"{MOVING} * np.sign(self.q[1])", "run: q0 moves by 0.05 rad under commands for -0.05 rad"),
+        (MOVING, f"3.0 * {MOVING}", "run: q0 moves by -0.15 rad under"),
+        (MOVING, "0.05 * joint_velocity", f"run: q0 moves by -0.025 rad {OTHER}"),
+        (SEEN, SEEN.replace("\n", "[[1, 0, 2]]\n", 1), "truth: at rest truth().feature is [-0.1"),
+        (SEEN, SEEN.replace("\n", " * [1, 1, 1000]\n", 1), "; both are of one camera, in one order and unit"),
+        ("setup.robot()", "setup.nominal.nominal, setup.start", "; the plant has to be the robot and camera that"),
+        ("self.model.feature(self.q), ", "np.full(3, np.nan), ", "truth: at rest truth().feature is [nan"),
+        ("self.model.jacobian(self.q)", "np.full((3, len(self.q)), np.nan)", "truth().jacobian misses nan%"),
+    ],
+)
+def test_a_world_that_is_not_the_robot_it_was_given_fails_with_one_line(tmp_path, right, wrong, line):
+    assert right in CELL
+    write(tmp_path, CELL.replace(right, wrong), "cell.py")
+    (failure,) = servobench.check_plant("./cell.py").failures
+    assert all(part in f"{failure.check}: {failure.text}" for part in line.partition(OTHER)), failure
+
+
+def test_a_plant_may_refuse_a_second_robot_or_have_small_errors_of_its_own(tmp_path):
+    own = CELL.replace("range(len(self.start))", "range(6)").replace(MOVING, f"0.9 * {MOVING}")
+    write(tmp_path, own.replace(SEEN, SEEN.replace("\n", " + 0.01\n", 1)), "cell.py")
+    report = servobench.check_plant("./cell.py")
+    assert report.ok, report
+    assert report.findings[0].text.startswith("not checked: cell.py:13: ValueError: ")
+    assert report.findings[0].text.endswith(OTHER)
 
 
 @pytest.mark.slow
