@@ -10,10 +10,21 @@ import numpy as np
 
 from servobench.controllers.aids import EQUIPPED, describe_aids
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.controllers.methods import with_aids
+from servobench.controllers.methods import AidedController, with_aids
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, is_refusal, naming, report
-from servobench.harness.check.rig import PERIOD, PREVIEW, Conditions, Driver, Rig, attributes, differing, watching_draws
+from servobench.harness.check.rig import (
+    PERIOD,
+    PREVIEW,
+    SEEDS,
+    Conditions,
+    Driver,
+    Rig,
+    Shared,
+    attributes,
+    differing,
+    watching_draws,
+)  # fmt: skip
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
 from servobench.harness.config.source import describe_at
@@ -27,7 +38,9 @@ STEPS: Final = 24
 STEPS_IF_SLOW: Final = 4
 SLOW: Final = 0.02  # [s] a step, beyond which runs are short
 LIMIT_TOLERANCE: Final = 1e-9
-APPROACH: Final = 60  # [periods] after which the error should have become smaller
+APPROACH: Final = 3.0  # [s] after which the error should have become smaller
+OTHER_PERIOD: Final = 0.02  # [s]
+LOSSES: Final = (range(1, 4), range(3), range(10, 20))  # periods in which the feature is lost
 ROUGH: Final = (1e-3, 1e3, 1e6)  # scales of features
 ONE_BY_ONE: Final = "its runs go one by one; those of a Law and an Estimator in a Servo may advance together"
 IN_LANES: Final = "its parts must be pure and take arrays with leading axes, see servobench/plant/contract/lanes.py"
@@ -94,7 +107,9 @@ class ControllerChecks:
 
     def constructor(self) -> None:
         """It can be built."""
-        self._build()
+        controller, _ = self._build()
+        own = controller.law.own if isinstance(controller, AidedController) else controller
+        self._shared = Shared(type(own))
 
     def command(self) -> None:
         """Each step returns n finite numbers."""
@@ -158,16 +173,17 @@ class ControllerChecks:
 
     def separate(self) -> None:
         """Two controllers in one process do not disturb each other."""
-        alone = self._driver().begin().run(self.steps)
-        one, other = self._driver().begin(), self._driver(seed=1).begin()
-        together = []
-        for _ in range(self.steps):
-            together.append(one.run(1)[0])
-            other.run(1)
-        if not np.array_equal(alone, together):
+        alone = []
+        for seed in range(SEEDS):
+            self._shared.restore()
+            alone.append(self._driver(seed).begin().run(self.steps))
+        drivers = [self._driver(seed).begin() for seed in range(SEEDS)]
+        together = [[each.run(1)[0] for each in drivers] for _ in range(self.steps)]
+        changed = ", ".join(self._shared.restore())
+        if not np.array_equal(np.stack(alone, axis=1), together):
             raise CheckFailed(
-                "two controllers in one process disturb each other through a variable of the module or the class; "
-                "keep all state in attributes that reset sets"
+                "two controllers in one process disturb each other through a variable of the module or the class"
+                f"{changed and f', {changed}'}; keep all state in attributes that reset sets"
             )
 
     def save(self) -> str | None:
@@ -195,8 +211,8 @@ class ControllerChecks:
 
     def lost_feature(self) -> None:
         """Commands are finite while the feature is lost, also from the start."""
-        for lost in (range(1, 4), range(3)):
-            self._driver(lost=lost).begin().run(min(self.steps, 6))
+        for lost in LOSSES:
+            self._driver(lost=lost).begin().run(min(self.steps, lost.stop + 3))
 
     def large_numbers(self) -> None:
         """Commands are finite for small and large features."""
@@ -228,14 +244,17 @@ class ControllerChecks:
 
     def approach(self) -> str | None:
         """It brings the feature nearer to its target."""
-        driver = self._driver().begin()
-        before = driver.rig.error()
-        driver.run(APPROACH if self.steps == STEPS else self.steps)
-        after, seconds = driver.rig.error(), driver.rollout.k * PERIOD
-        if after <= before:
-            return None
-        hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""
-        return f"on a made-up arm the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s{hint}"
+        for period in (PERIOD, OTHER_PERIOD):
+            with naming("" if period == PERIOD else f"a period of {1e3 * period:g} ms, knowledge.spec.period"):
+                driver = self._driver(period=period, preview=round(PREVIEW * PERIOD / period)).begin()
+                before = driver.rig.error()
+                driver.run(round(APPROACH / period) if self.steps == STEPS else self.steps)
+            after, seconds = driver.rig.error(), driver.rollout.k * period
+            if after > before:
+                hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""
+                grows = f"the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s"
+                return f"on a made-up arm {grows} with a period of {1e3 * period:g} ms{hint}"
+        return None
 
     def time(self) -> str | None:
         """A step fits into a control period."""
@@ -285,14 +304,14 @@ class ControllerChecks:
                 raise CheckFailed(f"two runs that advance together have other commands than each alone; {IN_LANES}")
         return None
 
-    def _build(self, preview: int = PREVIEW) -> tuple[Controller, Rig]:
-        rig = Rig(JOINTS, FEATURES)
+    def _build(self, preview: int = PREVIEW, period: float = PERIOD) -> tuple[Controller, Rig]:
+        rig = Rig(JOINTS, FEATURES, period)
         knowledge = rig.knowledge(truth=self.entry.needs_truth, preview=preview)
         return self.entry.build(default_config(self.entry), knowledge), rig
 
-    def _driver(self, seed: int = 0, **conditions: Any) -> Driver:  # noqa: ANN401 - those of `Conditions`
+    def _driver(self, seed: int = 0, period: float = PERIOD, **conditions: Any) -> Driver:  # noqa: ANN401 - `Conditions`
         chosen = Conditions(**conditions)
-        controller, rig = self._build(chosen.preview)
+        controller, rig = self._build(chosen.preview, period)
         rig.conditions = chosen
         return Driver(controller, rig, seed)
 

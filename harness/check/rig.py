@@ -2,6 +2,7 @@
 
 import contextlib
 import random
+import sys
 import traceback
 from collections.abc import Iterator
 from copy import deepcopy
@@ -24,6 +25,7 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 
 PERIOD: Final = 0.05  # [s]
 PREVIEW: Final = 10  # [rows]
+SEEDS: Final = 2  # of runs
 MAX_PERIODS: Final = 1000  # of a run
 BEND: Final = 0.02  # [1/rad²]
 MODEL_ERROR: Final = 1.05  # nominal over true Jacobian
@@ -49,20 +51,22 @@ class Rig(Plant):
         farthest: largest joint position at which the model was asked for its Jacobian [rad].
     """
 
-    def __init__(self, n: int, m: int) -> None:
+    def __init__(self, n: int, m: int, period: float = PERIOD) -> None:
         """Make the arm.
 
         Args:
             n: number of joints.
             m: number of features.
+            period: [s] between two commands.
         """
         self.conditions, self.farthest = Conditions(), 0.0
         rng = np.random.default_rng([n, m, 0])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
-        self.start, self.goal = rng.uniform(-0.5, 0.5, (2, n))
+        self.places = rng.uniform(-0.5, 0.5, (SEEDS, 2, n))  # start and goal [rad] of each seed
+        self.start, self.goal = self.places[0]
         joints, features = (tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("q", n), ("y", m)))
-        self.spec = PlantSpec.of_joints(joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), PERIOD)
+        self.spec = PlantSpec.of_joints(joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), period)
 
     def feature(self, q: FloatArray) -> FloatArray:
         """Return the true feature (..., m) [m] at joint positions (..., n) [rad]."""
@@ -95,13 +99,13 @@ class Rig(Plant):
         """See `Plant.step`; an arm at its goal stays there."""
         if not self.conditions.at_goal:
             limit = self.spec.joint_velocity_limit
-            moved = self.q + np.clip(command.joint_velocity, -limit, limit) * PERIOD
+            moved = self.q + np.clip(command.joint_velocity, -limit, limit) * self.spec.period
             self.q = np.clip(moved, self.spec.joint_lower, self.spec.joint_upper)
         self._k += 1
         return self._observe()
 
     def _observe(self) -> Observation:
-        feature, time = self.feature(self.q), self._k * PERIOD
+        feature, time = self.feature(self.q), self._k * self.spec.period
         if self.conditions.at_goal:
             return Observation(time, self.q, feature)
         noisy = feature + self._rng.normal(scale=NOISE, size=self.spec.m)
@@ -136,18 +140,19 @@ class Driver:
     """Drives a controller on a rig; a run can be continued after a part of its periods."""
 
     def __init__(self, controller: Controller, rig: Rig, seed: int = 0) -> None:
-        """Take controller, rig, and the seed of the noise, which `reset` gets, too."""
+        """Take controller, rig, and the seed of start, goal and noise, which `reset` gets, too."""
         self.controller, self.rig, self.seed = controller, rig, seed
         self._held = HeldController(controller, rig.spec)
         self.times: list[float] = []  # [s] of each step
 
     def begin(self) -> Self:
         """Reset the controller."""
-        conditions, goal = self.rig.conditions, self.rig.feature(self.rig.goal)
-        desired = conditions.scale * np.tile(goal, (MAX_PERIODS + conditions.preview, 1))
+        conditions, rig = self.rig.conditions, self.rig
+        rig.start, rig.goal = rig.places[self.seed]
+        desired = conditions.scale * np.tile(rig.feature(rig.goal), (MAX_PERIODS + conditions.preview, 1))
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)
-        self.rollout = begin(self.rig, self._held, desired, length, (self.seed, self.seed))
+        self.rollout = begin(rig, self._held, desired, length, (self.seed, self.seed))
         return self
 
     def run(self, count: int) -> FloatArray:
@@ -194,11 +199,13 @@ def _states() -> dict[str, object]:
 
 
 def attributes(thing: object) -> dict[str, Any]:
-    """Return the attributes of an object as they are now; those of which there is no copy as they are."""
-    found = dict(getattr(thing, "__dict__", {}))
-    for name, value in found.items():
-        with contextlib.suppress(Exception):
-            found[name] = deepcopy(value)
+    """Return copies of the plain attributes of an object as they are now."""
+    plain = int, float, str, list, tuple, dict, set, np.ndarray, np.generic, type(None)
+    found = {}
+    for name, value in vars(thing).items():
+        with contextlib.suppress(Exception):  # objects in a list that cannot be copied
+            if isinstance(value, plain) and not name.startswith("__"):
+                found[name] = deepcopy(value)
     return found
 
 
@@ -210,10 +217,32 @@ def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
 
 def _same(one: object, other: object) -> bool:
     try:
-        if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-            return bool(np.array_equal(one, other, equal_nan=one.dtype.kind == "f"))
-        if isinstance(one, int | float | str | bool | list | tuple | dict | type(None)):
-            return bool(one == other)
-    except ValueError:  # arrays within
-        return repr(one) == repr(other)
-    return True  # objects of other kinds cannot be compared
+        np.testing.assert_equal(one, other)
+    except (AssertionError, ValueError):
+        return False
+    return True
+
+
+class Shared:
+    """The variables that all controllers of a class share, those of the class and its module, in code of users."""
+
+    def __init__(self, kind: type) -> None:
+        """Keep their values."""
+        modules = {each.__module__: sys.modules.get(each.__module__) for each in kind.__mro__}
+        users = {name: each for name, each in modules.items() if is_users(getattr(each, "__file__", None) or "<")}
+        self._owners = users | {each.__name__: each for each in kind.__mro__ if each.__module__ in users}
+        self._before = {name: attributes(each) for name, each in self._owners.items()}
+        self._known = {name: {*vars(each)} for name, each in self._owners.items()}
+
+    def restore(self) -> list[str]:
+        """Give them back the values that were kept, and return the names of those that had changed."""
+        changed = []
+        for place, owner in self._owners.items():
+            before = self._before[place]
+            for name in differing(before, attributes(owner)):
+                if name in before:
+                    setattr(owner, name, deepcopy(before[name]))
+                elif name not in self._known[place]:
+                    delattr(owner, name)
+                changed.append(name)
+        return changed
