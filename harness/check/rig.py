@@ -148,7 +148,7 @@ class Driver:
     def begin(self) -> Self:
         """Reset the controller."""
         conditions, rig = self.rig.conditions, self.rig
-        rig.start, rig.goal = rig.places[self.seed]
+        rig.start, rig.goal = rig.places[self.seed % SEEDS]
         desired = conditions.scale * np.tile(rig.feature(rig.goal), (MAX_PERIODS + conditions.preview, 1))
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)
