@@ -122,10 +122,8 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         m, times = len(setting.feature.names), np.linspace(0.0, scenario.duration, POINTS)
         points = np.asarray(scenario.reference.at(times))
         if points.shape != (POINTS, m) or not np.isfinite(points).all():
-            wanted = f"{m} finite features at each of {POINTS} instants"
-            raise ConfigurationError(
-                f"its reference must be {wanted}, got shape {points.shape} and {points[:1].tolist()}"
-            )
+            got = f"shape {points.shape} and {points[:1].tolist()}"
+            raise ConfigurationError(f"its reference must be {m} finite features at {POINTS} instants, got {got}")
         last = (resolved.run.periods(scenario.duration) - 1) * resolved.run.period
         if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:  # a move is judged by its settling
             part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
@@ -244,6 +242,9 @@ def _assemble(
     setup = PlantSetup(true, start, run.period, robot)
     with configuration_errors(f"plant {request.plant}: ", RunFault):
         plant = entry.build(resolved.plant, setup)
+    if plant.spec.period != run.period:
+        plant.close()
+        raise ConfigurationError(f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s")
     try:
         if true is not None and request.mismatch.size("camera_move") > 0.0:
             with configuration_errors(f"plant {request.plant}: "):
@@ -270,12 +271,11 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     try:
         experiment = build(run, progress=progress)
         experiment.plant.close()
-        _check_repeats(run, experiment.drawn)
+        if run.request.task not in TASKS:
+            _check_repeats(run, experiment.drawn)
         _check_features(run, experiment)
-    except ConfigurationError:
-        raise
     except BaseException as error:
-        if ends_batch(error):
+        if isinstance(error, ConfigurationError) or ends_batch(error):
             raise
         return  # of a plug-in; its run will fail in the same way
     check_possible(run, experiment)
@@ -293,8 +293,9 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
         if values is None:
             continue
-        rows = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
-        for joint, value, lower, upper in rows:
+        for joint, value, lower, upper in zip(
+            spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True
+        ):
             if not lower <= value <= upper:
                 wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
                 raise ConfigurationError(f"task {run.request.task}: {what} must be {wanted}, got {value:g}")
@@ -302,13 +303,9 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
 
 
 def _check_repeats(run: ResolvedRun, drawn: Drawn) -> None:
-    """Refuse a user's task that makes another scenario for the same setting."""
-    if run.request.task in TASKS:
-        return
-    again, times = run.task.scenario(drawn.setting), np.linspace(0.0, drawn.scenario.duration, POINTS)
-    first, other = (
-        (each.reference.at(times).tolist(), np.array(each.start).tolist()) for each in (drawn.scenario, again)
-    )
+    """Refuse a task of a user's that makes another scenario for the same setting."""
+    both, times = (drawn.scenario, run.task.scenario(drawn.setting)), np.linspace(0.0, drawn.scenario.duration, POINTS)
+    first, other = ([each.reference.at(times).tolist(), np.array(each.start).tolist()] for each in both)
     if first != other:
         differs = "its scenario differs from one call to the next; draw from setting.seed alone"
         raise ConfigurationError(f"task {run.request.task}: {differs}")
@@ -431,9 +428,8 @@ def _check_extents(resolved: ResolvedRun, nominal: RobotModel | None) -> None:
 def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> None:
     """Refuse a target or a curve that no true robot of the run's mismatch can reach, by its farthest point."""
     task, robot = resolved.request.task, find_robot(resolved.request.robot)
-    if find_task(task).out_of_reach or not resolved.task.any_robot:  # other targets are taught on the true robot
-        return
-    if resolved.request.sensing != DEFAULT_SENSING:  # the features are no places
+    taught = not resolved.task.any_robot  # on the true robot
+    if find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING:  # features of no place
         return
     nominal, times = robot.nominal, np.linspace(0.0, scenario.duration, POINTS)
     points = np.unique(scenario.reference.at(times), axis=0)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -73,11 +74,16 @@ def test_settings_of_a_plant_reach_it(tmp_path):
 def test_a_class_is_taken_in_python_and_its_robot_may_be_its_own():
     from kit.toy_plants import Plain
 
-    run = servobench.run(
-        "constant", Plain, task="target", mismatch="none",
-        settings={"target": {"target": [0.0, 0.0], "duration": 6.0}, "constant": {"initial": {"source": "probe"}}},
-    )  # fmt: skip
+    class Fixed(Plain):
+        def __init__(self, setup):
+            super().__init__(replace(setup, period=0.02))
+
+    target = {"target": [0.0, 0.0], "duration": 6.0}
+    how = {"mismatch": "none", "settings": {"target": target, "constant": {"initial": {"source": "probe"}}}}
+    run = servobench.run("constant", Plain, task="target", **how)
     assert run.row["outcome"] == "settled", run.row["reason"]
+    with pytest.raises(ConfigurationError, match=r"Fixed: spec\.period must be that of its setup, 0\.05 s"):
+        servobench.run("constant", Fixed, task="target", **how)
 
 
 def test_what_changed_since_a_batch_began_is_named():

@@ -103,7 +103,7 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
     ("change", "words"),
     [
         (("return Scenario", "Scenario"), "its method scenario must return a servobench.Scenario, got None"),
-        (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at each .*, got .*nan"),
+        (("radius * np.sin(angle)", "np.nan * angle"), "its reference must be 3 finite features at 12 .*, got .*nan"),
         (("curve = setting.followed(", "curve = FixedPoint(np.zeros(2)) or ("),
          r"its .* 3 finite features .*got shape \(12, 2\)"),
         (("self.duration / 2)", "self.duration - 0.01)"), ".*begins at 0.99 s, after the last .* at 0.95 s"),
