@@ -34,6 +34,7 @@ from servobench.plant.cameras.symbolic import (
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.mechanics import FREQUENCIES, MAX_PART
 
+IN_MACROS = {ord("("): "_", ord(")"): ""}  # DER(BALL) is DER_BALL there
 # Generated functions do not use all of their parameters; none of them is exported by the library.
 HEAD = """/* Generated with CasADi's code generator; not meant to be edited. */
 #ifdef __GNUC__
@@ -80,17 +81,13 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Ma
         "N_GROUPS": len(layout.groups),
         "N_VALUES": layout.size,
         "N_SETTABLE": sum(group.size for group in settable),
-        **{f"OFFSET_{_macro(name)}": offset for name, offset in layout.offsets.items()},
+        **{f"OFFSET_{name.upper().translate(IN_MACROS)}": offset for name, offset in layout.offsets.items()},
         **constants,
         "GROUPS": _initialiser(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups),
         "START_VALUES": _initialiser(float(value).hex() for value in values),
         "MINIMA": _initialiser(minima),
     }
     return LAYOUT.format("\n".join(f"#define {name} {value}" for name, value in macros.items()))
-
-
-def _macro(name: str) -> str:
-    return name.upper().replace("DER(", "DER_").replace(")", "")
 
 
 def _initialiser(values: Iterable[str]) -> str:

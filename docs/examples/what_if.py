@@ -8,15 +8,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 
 REQUEST = RunRequest("kinematic", "regression_mfac", "circle", "moderate", seed=7)
 KNOCKED_AT, FUTURE = (40, 120, 200), 80  # [periods]
 ANGLES = np.radians([0.0, 15.0, 30.0, 60.0, 90.0])
 
 if __name__ == "__main__":
-    experiment = build_experiment(REQUEST, Settings())
+    experiment = build(resolve(REQUEST, Settings()))
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
     desired = experiment.scenario.reference.sampled(run.period, max(KNOCKED_AT) + FUTURE + 1 + run.preview_rows)
     pose = experiment.drawn.true.X_BC

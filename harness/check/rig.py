@@ -25,7 +25,6 @@ from servobench.plant.contract.signals import Command, Observation, PlantSpec, T
 
 PERIOD: Final = 0.05  # [s]
 PREVIEW: Final = 10  # [rows]
-SEEDS: Final = 2  # of runs
 MAX_PERIODS: Final = 1000  # of a run
 BEND: Final = 0.02  # [1/rad²]
 MODEL_ERROR: Final = 1.05  # nominal over true Jacobian
@@ -63,7 +62,7 @@ class Rig(Plant):
         rng = np.random.default_rng([n, m, 0])
         left, _, right = np.linalg.svd(rng.normal(size=(m, n)), full_matrices=False)
         self.A = left * np.linspace(0.4, 0.8, min(n, m)) @ right  # [m/rad], well conditioned
-        self.places = rng.uniform(-0.5, 0.5, (SEEDS, 2, n))  # start and goal [rad] of each seed
+        self.places = rng.uniform(-0.5, 0.5, (2, 2, n))  # start and goal [rad] of each seed
         self.start, self.goal = self.places[0]
         joints, features = (tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("q", n), ("y", m)))
         self.spec = PlantSpec.of_joints(joints, features, np.full(n, 1.0), np.full(n, -6.0), np.full(n, 6.0), period)
@@ -148,7 +147,7 @@ class Driver:
     def begin(self) -> Self:
         """Reset the controller."""
         conditions, rig = self.rig.conditions, self.rig
-        rig.start, rig.goal = rig.places[self.seed % SEEDS]
+        rig.start, rig.goal = rig.places[self.seed % len(rig.places)]
         desired = conditions.scale * np.tile(rig.feature(rig.goal), (MAX_PERIODS + conditions.preview, 1))
         desired.flags.writeable = False
         length = LoopSettings(MAX_PERIODS, conditions.preview)

@@ -165,9 +165,7 @@ def info(file: FileArgument) -> None:
     rows = []
     for each in described.modelVariables:
         size = " × ".join(map(str, shape_of(each))) or "1"
-        rows.append((each.name, each.causality or "local", size, each.unit or "", _shortened(str(each.start or ""))))
+        start = str(each.start or "")
+        start = start if len(start) <= 24 else f"{start[:23]}…"
+        rows.append((each.name, each.causality or "local", size, each.unit or "", start))
     print_rows(("name", "causality", "size", "unit", "start"), rows)
-
-
-def _shortened(text: str, width: int = 24) -> str:
-    return text if len(text) <= width else f"{text[: width - 1]}…"

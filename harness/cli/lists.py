@@ -29,14 +29,7 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.batch.trials import choose
-    from servobench.harness.config.registry import find_plant
-
-    if name:
-        name = choose("plant", name)
-        _show_settings(name, find_plant(name).config(), as_json=as_json)
-    else:
-        _show_names(_listed("plant"), as_json=as_json)
+    _list_or_show("plant", name, as_json=as_json)
 
 
 def controllers(
@@ -45,16 +38,9 @@ def controllers(
 ) -> None:
     """List the controllers, or show the settings of one."""
     from servobench.controllers.methods import ESTIMATORS, LAWS
-    from servobench.harness.batch.trials import choose
-    from servobench.harness.config.registry import find_controller
-    from servobench.harness.config.settings import default_config
 
-    if name:
-        name = choose("controller", name)
-        _show_settings(name, default_config(find_controller(name)), as_json=as_json)
-        return
-    _show_names(_listed("controller"), as_json=as_json)
-    if not as_json:
+    _list_or_show("controller", name, as_json=as_json)
+    if not (name or as_json):
         console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
         console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
 
@@ -132,16 +118,22 @@ def _described(name: str, summary: str) -> dict[str, str]:
     return {"name": name, "summary": summary}
 
 
-def _listed(word: Word) -> list[dict[str, str]]:
-    """Return the names of a kind with their summaries, or with the fault of those that cannot be used."""
-    from servobench.harness.batch.trials import try_all
+def _list_or_show(word: Word, name: str | None, *, as_json: bool) -> None:
+    """Show the settings of one, or all names with their summaries or the faults of those that cannot be used."""
+    from servobench.harness.batch.trials import choose, try_all
     from servobench.harness.config.registry import REGISTRIES
+    from servobench.harness.config.settings import default_config
 
+    registry = REGISTRIES[word]
+    if name:
+        entry = registry.find(name := choose(word, name))
+        _show_settings(name, entry.config() if word == "plant" else default_config(entry), as_json=as_json)
+        return
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
         for each in try_all(word, DEFAULT_ROBOT)
     ]
-    return found + [{"name": name, "error": line} for name, line in REGISTRIES[word].unused_points()]
+    _show_names(found + [{"name": name, "error": line} for name, line in registry.unused_points()], as_json=as_json)
 
 
 def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:

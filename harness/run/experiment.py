@@ -180,11 +180,6 @@ class Experiment:
         return np.stack(arrays) if self.together else arrays[0]
 
 
-def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
-    """Make a run ready from a request and overrides of the defaults; see `build`."""
-    return build(resolve(request, settings))
-
-
 def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experiment:
     """Make a run ready.
 

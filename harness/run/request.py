@@ -290,13 +290,11 @@ def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     """Return the set-up called `name` that a file defines, or without a name its only one."""
     setups = {key: value for key, value in vars(source.load()).items() if isinstance(value, SensingSetup)}
     found = {key: value for key, value in setups.items() if value not in SETUPS.values()}
-    if name is None and len(found) == 1:
-        return next(iter(found.values()))
-    if name in found:
-        return found[name]
     if not found:
         wanted = "no object of servobench.plant.cameras.setups.SensingSetup"
         raise ConfigurationError(f"{file} defines no sensing set-up: {wanted}")
-    first, *_ = found
+    first, *others = found
+    if name in found or (name is None and not others):
+        return found[name or first]
     wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
     raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

@@ -10,8 +10,9 @@ from kit.robots import FOUR_JOINTS, calibration_text
 from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
 SHORT = Settings({"exp2": {"duration": 3.0}})
@@ -48,7 +49,7 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(mo
     arguments = "--fmi", "3", "--mismatch", "severe", "--seed", "3", "-o", str(path)
     assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
     start = {variable.name: variable.start for variable in read_information(path).description.modelVariables}
-    run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
+    run = build(resolve(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings()))
     exported = np.array(start["joint_offset"].split(), dtype=float)
     np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)
 

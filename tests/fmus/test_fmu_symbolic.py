@@ -14,8 +14,9 @@ from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.faults import ConfigurationError
@@ -136,7 +137,7 @@ def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_ar
 @pytest.mark.slow
 def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     path = mapped(tmp_path, MAPPING + NOMINAL)
-    experiment = build_experiment(request(path, "constant"), quiet(path))
+    experiment = build(resolve(request(path, "constant"), quiet(path)))
     observation = experiment.plant.reset(0)
     experiment.controller.reset(observation, 0)
     experiment.controller.step(observation, np.tile([0.2, 0.7], (11, 1)))
@@ -184,7 +185,7 @@ def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, ol
     assert old in description
     path = mapped(tmp_path, description=description.replace(old, new))
     with pytest.raises(ConfigurationError, match=f"controller {controller}: .*{message}") as caught:
-        build_experiment(request(path, controller), quiet(path))
+        build(resolve(request(path, controller), quiet(path)))
     assert "\n" not in str(caught.value)
 
 
@@ -201,7 +202,7 @@ def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, ol
 def test_a_mapping_whose_models_do_not_fit_is_one_clear_line(tmp_path, text, message):
     path = mapped(tmp_path, text)
     with pytest.raises(ConfigurationError, match=f"plant fmu:.*{message}"):
-        build_experiment(request(path, "constant"), quiet(path))
+        build(resolve(request(path, "constant"), quiet(path)))
 
 
 def test_an_fmu_of_fmi_3_is_told_by_its_version():

@@ -13,7 +13,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run import starts
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build_experiment, draw
+from servobench.harness.run.experiment import build, draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.harness.studies.challenge import find_challenge
@@ -60,9 +60,8 @@ def test_features_are_in_its_image_and_change_at_its_rate():
 
 
 def test_its_noise_is_that_of_the_file():
-    plant = build_experiment(
-        request(), Settings({"run": {"period": 0.067}, "kinematic": {"command_delay": 0.067}})
-    ).plant
+    settings = Settings({"run": {"period": 0.067}, "kinematic": {"command_delay": 0.067}})
+    plant = build(resolve(request(), settings)).plant
     observation = plant.reset(4)
     errors = []
     for _ in range(200):

@@ -7,7 +7,7 @@ from servobench.controllers.controller import ControllerEntry, Delays
 from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import controller_names, engine_of, find_controller, offering
 from servobench.harness.config.settings import Settings, read_settings
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import ConfigurationError
@@ -83,13 +83,13 @@ def knowledge_of(plant, needs_truth, settings, **request):
     """Return what a controller on a plant is given."""
     seen, constant = [], find_controller("constant")
 
-    def build(config, knowledge):
+    def spy(config, knowledge):
         seen.append(knowledge)
         return constant.build(config, knowledge)
 
-    with offering([own_object(CONTROLLER, ControllerEntry("spy", "", constant.config, build, needs_truth))]):
+    with offering([own_object(CONTROLLER, ControllerEntry("spy", "", constant.config, spy, needs_truth))]):
         run = RunRequest(plant, "spy", "exp1", "moderate", 0, request)
-        build_experiment(run, Settings({plant: settings})).plant.close()
+        build(resolve(run, Settings({plant: settings}))).plant.close()
     return seen[0]
 
 

@@ -15,7 +15,7 @@ from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures.replay import logged_run
 from servobench.harness.run import resolution as resolved
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build_experiment, train_networks
+from servobench.harness.run.experiment import build, train_networks
 from servobench.harness.run.export import arm_product, loop_products
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
@@ -67,7 +67,7 @@ def test_a_taught_random_move_is_free_of_contact():
     work = find_robot("panda").workspace
     for seed in range(5):
         request = replace(PANDA, task="random", mismatch="none", seed=seed)
-        assert work.clear(build_experiment(request, Settings()).scenario.start)
+        assert work.clear(build(resolve(request, Settings())).scenario.start)
 
 
 def test_a_batch_has_one_robot():
@@ -92,7 +92,7 @@ def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
 @pytest.mark.slow
 def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
-    experiment = build_experiment(request, Settings())
+    experiment = build(resolve(request, Settings()))
     knowledge = experiment.controller.servo.knowledge
     assert (knowledge.nominal_jacobian, knowledge.train) == (None, None)
     config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
@@ -112,7 +112,7 @@ def test_what_counts_on_no_model_keeps_its_values_on_an_arm_that_nobody_knows():
 
 def test_bounds_are_given_the_kinematics_of_rippled_gears():
     request = RunRequest("kinematic", "calibrated", "circle", "moderate+ripple=0.03rad", 3)
-    experiment = build_experiment(request, Settings())
+    experiment = build(resolve(request, Settings()))
     experiment.plant.reset(0)
     truth, start = experiment.plant.truth(), np.asarray(experiment.scenario.start)
     knowledge = experiment.controller.servo.knowledge

@@ -15,7 +15,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import build, build_experiment, train_networks
+from servobench.harness.run.experiment import build, train_networks
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.request import RunRequest, find_sensing
@@ -37,7 +37,7 @@ def request(
 
 
 def drawn(sensing: str, task: str, seed: int = 0, **more: object):
-    return build_experiment(request(sensing, task, seed=seed, **more), Settings({})).drawn
+    return build(resolve(request(sensing, task, seed=seed, **more), Settings({}))).drawn
 
 
 # --- units
@@ -45,7 +45,7 @@ def drawn(sensing: str, task: str, seed: int = 0, **more: object):
 
 def test_laws_and_estimators_see_a_metre_whatever_the_unit():
     """A plant in millimetres is controlled, joint for joint, as the same plant in metres."""
-    experiment = build_experiment(request("position"), Settings({}))
+    experiment = build(resolve(request("position"), Settings({})))
     knowledge = experiment.controller.servo.knowledge
     spec = replace(knowledge.spec, feature=replace(knowledge.spec.feature, unit="mm", scale=1000.0))
     in_mm = replace(knowledge, spec=spec, nominal_jacobian=lambda q: 1000.0 * knowledge.nominal_jacobian(q))

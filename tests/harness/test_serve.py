@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from kit.served import REQUEST, SPEED, Bytes, commanding, connected, packed, served, waited_for
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
+from servobench.harness.run.resolution import resolve
 from servobench.harness.serve.program import ControlProgram, profile, script_version
 from servobench.harness.serve.server import Server
 from servobench.harness.serve.wire import CONTROLLER, INPUTS, NOT_FOUND, OUTPUTS, Recipe, WireError
@@ -69,7 +70,7 @@ def test_a_list_without_names_is_no_recipe():
 
 def test_a_commanded_period_is_that_of_a_run(lockstep):
     server, address, _ = lockstep
-    experiment = build_experiment(REQUEST, Settings({}))
+    experiment = build(resolve(REQUEST, Settings({})))
     plant = experiment.plant
     plant.reset(named_seed(REQUEST.seed, "plant"))
     with commanding(server, address) as client:
@@ -166,7 +167,7 @@ def program_of(spec, lines, **how):
 
 @pytest.fixture(scope="module")
 def spec():
-    experiment = build_experiment(REQUEST, Settings({"run": {"period": 0.002}}))
+    experiment = build(resolve(REQUEST, Settings({"run": {"period": 0.002}})))
     yield experiment.plant.spec
     experiment.plant.close()
 

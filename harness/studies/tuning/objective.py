@@ -261,10 +261,6 @@ class Ledger:
         if parts := ", ".join(key for key, value in self._fingerprint.items() if known.get(key) != value):
             raise ConfigurationError(f"study {self.path} was made with other {parts}; name another folder with --out")
 
-    def __len__(self) -> int:
-        """Return the number of scored points."""
-        return len(self._costs)
-
     def best(self) -> float | None:
         """Return the least mean cost, or None while there is none."""
         return min((sum(costs) / len(costs) for costs in self._costs.values()), default=None)
