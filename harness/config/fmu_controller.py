@@ -107,7 +107,7 @@ class FmuController(Controller):
         check_roles({"outputs": found["outputs"], "jacobian": found["jacobian"], **given}, given, self._description)
         units = {"outputs": "rad/s", "joints": "rad", "features": feature_unit, "reference": feature_unit}
         for role, unit in units.items():
-            check_unit(role, found[role], unit)
+            check_unit(role, found[role], unit, any_quantity=role in ("features", "reference"))
         taken = {variable.name for variables in given.values() for variable in variables}
         inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
         if idle := [name for name in inputs if name not in taken]:

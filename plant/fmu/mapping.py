@@ -23,12 +23,14 @@ from servobench.plant.contract.settings import File, Names, Numbers, Positive, U
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.contract.units import SPELLINGS, UNITS
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
+from servobench.plant.fmu.library import logger
 
 Roles = TypeVar("Roles")
 # Units of FMUs that are never another spelling of the wanted one.
 DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit not in {"", "%"}} | {
-    "m/s", "mm/s", "rad/s2", "deg/s2", "m/s2", "N", "N.m", "A", "V",
+    "um", "km", "mrad", "rev", "mrad/s", "rpm", "m/s", "mm/s", "rad/s2", "deg/s2", "m/s2", "N", "N.m", "A", "V",
 }  # fmt: skip
+REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}  # outputs that may be named more than once, such as one flag
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
 
 
@@ -182,11 +184,12 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     found = {role: description.select(names, role) for role, names, *_ in roles}
     again = ("truth.features", "truth.states")
     check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
-    for variable in found["features"]:
-        if is_other_unit(variable.unit, unit):
-            raise ValueError(f"names.feature_unit must be {variable.unit}, the unit of {variable.name}, got {unit}")
+    declared = {variable.unit.translate(SPELLINGS): variable.name for variable in found["features"]}
+    if (known := DECLARED & declared.keys()) and unit.translate(SPELLINGS) not in known:
+        told = min(known)
+        raise ValueError(f"names.feature_unit must be {told}, the unit of {declared[told]}, got {unit}")
     for role, names, size, own_unit in roles:
-        check_unit(role, found[role], own_unit)
+        check_unit(role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian")))
         if names and (came := total_size(found[role])) != size:
             raise ValueError(f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}")
     return PlantSpec.of_joints(
@@ -210,27 +213,26 @@ def check_roles(roles: Mapping[str, Iterable[Variable]], inputs: Container[str],
     for role, variable in ((role, variable) for role, variables in roles.items() for variable in variables):
         if role in inputs and variable.causality != "input":
             raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
-        if (other := taken.get(variable.name)) is not None:
+        other = taken.get(variable.name)
+        if {other, role} == {"joints", "features"} and role not in inputs:
+            logger.warning("features name the joint %s; a camera measures other quantities", variable.name)
+        elif other is not None and (other != role or role in inputs or role not in REPEATED):
             how = "twice" if other == role else f"as {other} does; each has its own"
             raise ValueError(f"{description.path.name}: {role} names {variable.name!r} {how}")
         taken[variable.name] = role
 
 
-def is_other_unit(unit: str, own: str) -> bool:
-    """Return whether a unit that an FMU declares is known and not the own one."""
-    return unit.translate(SPELLINGS) != own and unit.translate(SPELLINGS) in DECLARED
-
-
-def check_unit(role: str, variables: Iterable[Variable], own: str) -> None:
-    """Refuse variables that the FMU declares in another unit.
+def check_unit(role: str, variables: Iterable[Variable], own: str, *, any_quantity: bool = False) -> None:
+    """Refuse variables that the FMU declares in another unit of the same quantity, or of another one.
 
     Raises:
         ValueError: names the variable and its unit.
     """
     for variable in variables:
-        if is_other_unit(variable.unit, own):
-            unit = variable.unit.translate(SPELLINGS)
-            remedy = "convert it in the FMU" if unit in UNITS.get(own, {}) else "name another variable"
+        unit, wanted = variable.unit.translate(SPELLINGS), own.translate(SPELLINGS)
+        same = unit in UNITS.get(wanted, {})  # quantity
+        if unit in DECLARED and unit != wanted and (same or not any_quantity):
+            remedy = "convert it in the FMU" if same else "name another variable"
             raise ValueError(f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}")
 
 

@@ -103,7 +103,7 @@ def spec_of(folder, units=None, **roles):
 @pytest.mark.parametrize(
     ("told", "given", "fits"),
     [("m", "mm", False), ("mm", "m", False), ("m", "m", True), ("1", "px", True), ("", "mm", True), ("rad", "m", False),
-     ("m", "rad", False), ("m", "px", False)],
+     ("m", "rad", False), ("m", "px", False), ("um", "m", False), ("°", "°", True), ("deg", "°", True)],
 )  # fmt: skip
 def test_a_unit_of_features_that_is_not_the_fmu_s_is_refused(tmp_path, told, given, fits):
     if fits:
@@ -119,6 +119,7 @@ def test_a_unit_of_features_that_is_not_the_fmu_s_is_refused(tmp_path, told, giv
         ("v", "deg/s", "inputs names 'v', whose unit is deg/s; wanted rad/s: convert it in the FMU"),
         ("q", "°", "joints names 'q', whose unit is deg; wanted rad: convert it in the FMU"),
         ("v", "N.m", "inputs names 'v', whose unit is N.m; wanted rad/s: name another variable"),
+        ("v", "rpm", "inputs names 'v', whose unit is rpm"),
         ("q", "m", "joints names 'q', whose unit is m; wanted rad: name another variable"),
         ("q0", "deg", "home names 'q0', whose unit is deg; wanted rad: convert"),
         ("at", "mm", r"camera\[1\] names 'at', whose unit is mm; wanted m: convert"),
@@ -135,7 +136,6 @@ def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, m
     ("roles", "message"),
     [
         ({"inputs": ("v", "v")}, "a.fmu: inputs names 'v' twice"),
-        ({"features": ("q",)}, "a.fmu: features names 'q' as joints does; each has its own"),
         ({"features": ("v",)}, "a.fmu: features names 'v' as inputs does"),
         ({"features": ("y", "y")}, "a.fmu: features names 'y' twice"),
         ({"seen": ("y",)}, "a.fmu: seen names 'y' as features does"),
@@ -147,3 +147,12 @@ def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, m
 def test_a_variable_in_two_roles_or_of_the_wrong_size_is_refused(tmp_path, roles, message):
     with pytest.raises(ValueError, match=message):
         spec_of(tmp_path, {"q0": ""}, **roles)
+
+
+def test_features_of_two_quantities_with_a_joint_and_outputs_named_twice_are_taken(tmp_path, caplog):
+    truth = TruthMapping(jacobian=("zero", "zero"))
+    spec = spec_of(
+        tmp_path, {"y": "m", "flag": "", "zero": "m"}, features=("y", "q"), seen=("flag", "flag"), truth=truth
+    )
+    assert spec.m == 2
+    assert "features name the joint q; a camera measures other quantities" in caplog.text
