@@ -274,6 +274,10 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
             HEAVY.replace('"fixed"', '"prismatic"'),
             ".*joint 'bridge' on .* is of type prismatic.*; write type=.fixed. if",
         ),
+        (
+            HEAVY.replace("0.35 0 0", "350 0 0"),
+            ": joint 'joint_4': origin.0 .* 350.0; if 350mm is meant, write 0.35, as",
+        ),
         (HEAVY.replace("0 0 0.3", "0 0 300"), ": joint 'joint_1': origin.2 .* 300.0; if 300mm is meant, write 0.3, as"),
         (
             HEAVY.replace("0 0 0.3", "0 3 0.3"),
