@@ -244,10 +244,16 @@ class ControllerChecks:
     def approach(self) -> str | None:
         """It brings the feature nearer to its target."""
         for period in (PERIOD, OTHER_PERIOD):
-            with naming("" if period == PERIOD else f"a period of {1e3 * period:g} ms, knowledge.spec.period"):
+            try:
                 driver = self._driver(period=period, preview=round(PREVIEW * PERIOD / period)).begin()
                 before = driver.rig.error()
-                driver.run(round(APPROACH / period) if self.steps == STEPS else self.steps)
+                driver.run(1)
+            except ValueError as error:
+                if period == PERIOD or not is_refusal(error):
+                    raise
+                return f"it does not run with a period of {1e3 * period:g} ms: {' '.join(str(error).split())}"
+            with naming("" if period == PERIOD else f"a period of {1e3 * period:g} ms, knowledge.spec.period"):
+                driver.run(round(APPROACH / period) - 1 if self.steps == STEPS else self.steps)
             after, seconds = driver.rig.error(), driver.rollout.k * period
             if after > before:
                 hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""

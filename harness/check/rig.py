@@ -203,8 +203,8 @@ def attributes(thing: object) -> dict[str, Any]:
     found = {}
     for name, value in vars(thing).items():
         with contextlib.suppress(Exception):  # objects in a list that cannot be copied
-            if isinstance(value, plain) and not name.startswith("__"):
-                found[name] = deepcopy(value)
+            if isinstance(value, plain) and not name.startswith("__") and _same(copy := deepcopy(value), value):
+                found[name] = copy
     return found
 
 

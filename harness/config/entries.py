@@ -425,7 +425,7 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
 def _guard_hint(module: ModuleType) -> str:
     """Return the remedy for a script whose classes may be in the part that only runs as a script; else empty."""
     with contextlib.suppress(OSError, TypeError):  # no file with source
-        if "__main__" in inspect.getsource(module):
+        if re.search(r"__main__.*^\s+class ", inspect.getsource(module), re.DOTALL | re.MULTILINE):
             return "; define it above `if __name__ == '__main__':`"
     return ""
 

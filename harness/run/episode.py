@@ -53,10 +53,9 @@ def carry_out(
     experiment = build(resolved)
     log, ending = StepLog(experiment.plant.spec, experiment.periods), Ending()
     with contextlib.closing(experiment.plant) as plant, careful():
-        desired = experiment.desired()
         try:
             pair = held_to_contract(plant, experiment.controller)
-            run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
+            run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
         except BaseException as error:
             if ends_batch(error) or (debug and not isinstance(error, RunFault)):
                 raise

@@ -54,19 +54,15 @@ class Drawn:
     """The values drawn for one run."""
 
     scenario: Scenario
-    setting: TaskSetting  # of the task, with the true robot
+    true: RobotModel | None = None  # the true robot and its cameras; None for a plant that brings its own
     sample: MismatchSample | None = None  # how it differs from the nominal one
+    moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
     cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
-
-    @property
-    def true(self) -> RobotModel | None:
-        """The true robot and its cameras; None for a plant that brings its own."""
-        return self.setting.model
 
     @property
     def final(self) -> RobotModel | None:
         """The true robot with the camera as it is at the end of the run."""
-        return self.setting.moved or self.true
+        return self.moved or self.true
 
     def as_record(self) -> dict[str, object]:
         """Return all values drawn for robot and cameras, for JSON."""
@@ -84,7 +80,7 @@ def draw(resolved: ResolvedRun) -> Drawn:
     true, sample, cameras = draw_robot(request)
     moved, nominal = sample.moved(true, robot), find_sensing(request.sensing).nominal(robot)
     setting = TaskSetting(true, true.arm.n, true.channel, named_seed(request.seed, "task"), moved, robot, nominal)
-    return Drawn(build_scenario(resolved, setting), setting, sample, cameras)
+    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
 
 
 @configuration_errors()
@@ -128,6 +124,11 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         if scenario.kind == "curve" and scenario.evaluate_from > last + 1e-9:  # a move is judged by its settling
             part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
             raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
+        if name not in TASKS:
+            again: Any = task.scenario(setting)
+            starts: list[Any] = [scenario.start, again.start]
+            if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
+                raise ConfigurationError("its scenario differs from one call to the next; draw from setting.seed alone")
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
@@ -163,7 +164,7 @@ class Experiment:
     def loop(self) -> LoopSettings:
         """The settings of the loop, with the camera's pose (..., 4, 4) after a move."""
         run, periods = self.run, self.periods
-        moved = [each.setting.moved.camera for each in self.runs if each.setting.moved is not None]
+        moved = [each.moved.camera for each in self.runs if each.moved is not None]
         move = CameraMove(int(run.camera_moves_at * periods), self._in_lanes(moved)) if moved else None
         return LoopSettings(periods, run.preview_rows, run.periods(run.lost_after), move)
 
@@ -203,8 +204,7 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
         setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
-        drawn = Drawn(build_scenario(resolved, setting), setting)
-        return Experiment(plant, controller, (drawn,), resolved.run, networks)
+        return Experiment(plant, controller, (Drawn(build_scenario(resolved, setting)),), resolved.run, networks)
     except BaseException:
         plant.close()
         raise
@@ -237,13 +237,14 @@ def _assemble(
     setup = PlantSetup(true, start, run.period, robot)
     with configuration_errors(f"plant {request.plant}: ", RunFault):
         plant = entry.build(resolved.plant, setup)
-    if plant.spec.period != run.period:
+    if not math.isclose(plant.spec.period, run.period):
         plant.close()
         raise ConfigurationError(f"plant {request.plant}: spec.period must be that of its setup, {run.period:g} s")
     try:
         if true is not None and request.mismatch.size("camera_move") > 0.0:
-            with configuration_errors(f"plant {request.plant}: "):
-                plant.move_camera(true.camera)  # refuses it where it cannot be moved
+            # Refused where it cannot be moved; a user's camera may lack something before its reset.
+            with contextlib.suppress(AttributeError, TypeError), configuration_errors(f"plant {request.plant}: "):
+                plant.move_camera(true.camera)
         if robot is None:
             trained = knowledge = RobotKnowledge(plant.spec, run.preview_rows, plant.nominal_jacobian())
         else:
@@ -266,8 +267,6 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     try:
         experiment = build(run, progress=progress)
         experiment.plant.close()
-        if run.request.task not in TASKS:
-            _check_repeats(run, experiment.drawn)
         _check_features(run, experiment)
     except BaseException as error:
         if isinstance(error, ConfigurationError) or ends_batch(error):
@@ -297,19 +296,12 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     _check_reach(run, scenario, spec)
 
 
-def _check_repeats(run: ResolvedRun, drawn: Drawn) -> None:
-    """Refuse a task of a user's that makes another scenario for the same setting."""
-    both, times = (drawn.scenario, run.task.scenario(drawn.setting)), np.linspace(0.0, drawn.scenario.duration, POINTS)
-    first, other = ([each.reference.at(times).tolist(), np.array(each.start).tolist()] for each in both)
-    if first != other:
-        differs = "its scenario differs from one call to the next; draw from setting.seed alone"
-        raise ConfigurationError(f"task {run.request.task}: {differs}")
-
-
 def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
     """Remark on a reference that is likely in mm or too fast for the arm, and on a user's features that hardly move."""
     spec, true, start = experiment.plant.spec, experiment.drawn.true, experiment.scenario.start
-    desired, task, unit = experiment.desired(), f"the reference of the task {run.request.task}", spec.feature_unit
+    task, unit = f"the reference of the task {run.request.task}", spec.feature_unit
+    with configuration_errors(f"task {run.request.task}: "):
+        desired = experiment.desired()
     if true is None or start is None:
         if unit == "m" and (size := np.abs(desired).max()) > MAX_PLACE:
             remark(f"{task} reaches {size:g} m; if places are meant in mm, write the unit, too")

@@ -45,6 +45,7 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
 DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
+CHECKED: Final = 1e-3  # the same where `rates` are checked: longer, so that single precision does
 POSES: Final = 5  # of the target, at which the functions of a user's set-up are checked
 RATE_TOLERANCE: Final = 1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
 
@@ -119,10 +120,12 @@ class SensingSetup:
         """Return how features of points (..., c, p, 3) change, (..., m, n), with motions (..., c, p, 3, n) [m]."""
         return (self.rates or self._differences)(points, motions, optics)
 
-    def _differences(self, points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
-        step = DIFFERENCE * np.moveaxis(motions, -1, 0)
+    def _differences(
+        self, points: FloatArray, motions: FloatArray, optics: Optics, h: float = DIFFERENCE
+    ) -> FloatArray:
+        step = h * np.moveaxis(motions, -1, 0)
         there, back = self.measure(points + step, optics), self.measure(points - step, optics)
-        return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * DIFFERENCE), 0, -1))
+        return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * h), 0, -1))
 
     def check(self) -> None:
         """Refuse functions that break their contract, at a few places of the target in front of the cameras.
@@ -132,8 +135,11 @@ class SensingSetup:
                 `rates` is not its derivative.
         """
         draw, places = np.random.default_rng(0).uniform, (POSES, self.cameras, len(self.target), 3)
-        points = np.array(self.target) + np.array([0.0, 0.0, 1.0]) + draw(-0.05, 0.05, places)
-        optics, motions = ideal_optics(CAMERA, self.cameras), draw(-1.0, 1.0, (*places, 2))
+        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [0.1, 0.0, 0.0]
+        points = np.array(self.target) + beside + draw(-0.05, 0.05, (POSES, 1, 1, 3))
+        moved, turned = draw(-1.0, 1.0, (2, POSES, 1, 1, 3, 2))  # of a rigid target
+        motions = np.zeros((*places, 2)) + moved + np.cross(turned, np.array(self.target)[..., None], axis=-2)
+        optics = ideal_optics(CAMERA, self.cameras)
         given = points.copy(), motions.copy()
         made = {"measure": self.measure(given[0], optics), "rates": self.change(*given, optics)}
         if not (np.array_equal(given[0], points) and np.array_equal(given[1], motions)):
@@ -143,9 +149,9 @@ class SensingSetup:
             if np.shape(values) != shape:
                 came = f"shape {shape} for points {places}, got {np.shape(values)}; index them as points[..., 0, 0, :]"
                 raise ConfigurationError(f"sensing {self.name}: {name} must return {came}")
-        differences = self._differences(points, motions, optics)
+        differences = self._differences(points, motions, optics, CHECKED)
         wrong = np.abs(made["rates"] - differences).max(axis=(0, 2))
-        if (wrong > RATE_TOLERANCE * np.abs(differences).max()).any():
+        if self.rates is not None and not (wrong <= RATE_TOLERANCE * np.abs(differences).max()).all():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"

@@ -250,9 +250,8 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
             if sum(map(_turns, ways[other])) >= 3:
                 remedy = f"name another link, such as #{other}"
             raise ValueError(f"joint {joint.name!r} on the way to {tip!r} {kind}, which is not modelled; {remedy}")
-        step = _pose(joint.origin)
-        read_value(f"joint {joint.name!r}: origin", tuple(step[:3, 3].tolist()), LENGTHS, lambda: "m")
-        pose = pose @ step
+        read_value(f"joint {joint.name!r}: origin", tuple(_pose(joint.origin)[:3, 3].tolist()), LENGTHS, lambda: "m")
+        pose = pose @ _pose(joint.origin)
         if _turns(joint):
             if not np.any(joint.axis):
                 raise ValueError(f"joint {joint.name!r} turns about the axis 0 0 0; the usual one is 0 0 1")

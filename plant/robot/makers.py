@@ -145,7 +145,7 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     """
     import yaml  # noqa: PLC0415 - lists of names start without it
 
-    path = ur5.shipped_calibration() if path is None else path
+    path = ur5.CALIBRATION if path is None else path
     keys = ("x", "y", "z", "roll", "pitch", "yaw")
     wanted = f"the blocks {', '.join(CALIBRATION_BLOCKS)}, each with {', '.join(keys)}"
     text = read_text("calibration file", path)

@@ -30,14 +30,10 @@ TUBE_RADIUS, SIDE_STEP = _FACTS["tube_radius"], _FACTS["side_step"]
 
 TOOL, SHOULDER, MOVES = _FACTS["tool"], _FACTS["shoulder"], _FACTS["moves"]
 HOME, STRETCHED = _FACTS["home"], _FACTS["stretched"]
+CALIBRATION: Final = DATA / "ur5_factory_calibration.yaml"  # of one real UR5
 TRAINING_LOWER, TRAINING_UPPER = _FACTS["training_lower"], _FACTS["training_upper"]
 
 
 def ur5_arm() -> SerialArm:
     """Return the UR5 by its data sheet."""
     return replace(arm_from_dh(DH_A, DH_D, DH_ALPHA, JOINT_NAMES), tool=np.array(TOOL))
-
-
-def shipped_calibration() -> Path:
-    """Return the calibration file of one real UR5, which is part of the package."""
-    return DATA / "ur5_factory_calibration.yaml"

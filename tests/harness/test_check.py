@@ -171,13 +171,13 @@ OTHER = "; this happens with a period of 100 ms and the robot panda"
 @pytest.mark.parametrize(
     ("right", "wrong", "line"),
     [
-        ("self.q = self.start", "self.q = np.degrees(self.start)", "run: reset must begin at setup.start, [0.65"),
+        ("self.q = self.start", "self.q = np.degrees(self.start)", "run: reset must begin at setup.start, [0.55"),
         (MOVING, f"np.radians({MOVING})", "run: q0 moves by -0.000873 rad under commands for -0.05 rad: commands"),
         (MOVING, f"{MOVING} * (np.arange(len(self.q)) != 3)", "run: q3 moves by 0 rad under"),
         (MOVING, f"{MOVING} * np.sign(self.q[1])", "run: q0 moves by 0.05 rad under commands for -0.05 rad"),
         (MOVING, f"3.0 * {MOVING}", "run: q0 moves by -0.15 rad under"),
         (MOVING, "0.05 * joint_velocity", f"run: q0 moves by -0.025 rad {OTHER}"),
-        (SEEN, SEEN.replace("\n", "[[1, 0, 2]]\n", 1), "truth: at rest truth().feature is [-0.1"),
+        (SEEN, SEEN.replace("\n", "[[1, 0, 2]]\n", 1), "truth: at rest truth().feature is ["),
         (SEEN, SEEN.replace("\n", " * [1, 1, 1000]\n", 1), "; both are of one camera, in one order and unit"),
         ("setup.robot()", "setup.nominal.nominal, setup.start", "; the plant has to be the robot and camera that"),
         ("self.model.feature(self.q), ", "np.full(3, np.nan), ", "truth: at rest truth().feature is [nan"),

@@ -15,7 +15,7 @@ from servobench.plant.robot import ur5
 
 BESIDE = "import helper\n" + WHOLE.replace("np.zeros(self.n)", "np.full(self.n, helper.SPEED)")
 BELOW = "from laws import gain\n" + WHOLE.replace("np.zeros(self.n)", "np.full(self.n, gain.SPEED)")
-CALIBRATION = Path(ur5.shipped_calibration()).read_text()
+CALIBRATION = ur5.CALIBRATION.read_text()
 WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0.4,0.1,1.2\n1,0.4,0.0,1.2\n"
 SETUP = """from servobench.plant.cameras.setups import SensingSetup
 SIDE = SensingSetup('side', '', ('x', 'y', 'z'), 'm', lambda points, optics: points[..., 0, 0, :])
