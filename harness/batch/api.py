@@ -149,9 +149,7 @@ def compare(
         how = Execution(workers, executor, Bounds(run_timeout, run_memory, isolate), resume)
         if not can_travel(offered([*worlds, *names, *batch.tasks])):
             if how.workers != 1 or how.scheduler or how.bounds != Bounds(isolate=False):
-                remark(
-                    "code of this batch cannot be sent to other processes; its runs stay in this one, without limits"
-                )
+                remark("code of this batch cannot be sent to other processes; its runs stay here, without limits")
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)
 

@@ -15,8 +15,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 from annotated_types import Ge
 
-from servobench.harness.config.entries import Guarded
-from servobench.harness.config.source import PLACE, SourceFile
+from servobench.harness.config.source import PLACE, SourceFile, describe_at
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -269,7 +268,12 @@ def _find(word: str, file: SourceFile | None) -> Sensing:
     own = {}
     if file is not None and found is not None:
         own[place] = _pick(file, found["file"], found["name"])
-        Guarded(own[place].check)()
+        try:
+            own[place].check()
+        except ConfigurationError:
+            raise
+        except Exception as error:
+            raise ConfigurationError(describe_at(error)) from error
     with configuration_errors():
         return Sensing.parse(word, {**SETUPS, **own})
 

@@ -186,8 +186,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
     declared = {variable.unit.translate(SPELLINGS): variable.name for variable in found["features"]}
     if (known := DECLARED & declared.keys()) and unit.translate(SPELLINGS) not in known:
-        told = min(known)
-        raise ValueError(f"names.feature_unit must be {told}, the unit of {declared[told]}, got {unit}")
+        raise ValueError(f"names.feature_unit must be {min(known)}, the unit of {declared[min(known)]}, got {unit}")
     for role, names, size, own_unit in roles:
         check_unit(role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian")))
         if names and (came := total_size(found[role])) != size:

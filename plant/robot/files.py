@@ -71,8 +71,7 @@ Lengths = tuple[Annotated[Number, Ge(-20.0), Le(20.0), Usual(5.0)], ...]
 Twists = tuple[Annotated[Number, Ge(-6.3), Le(6.3)], ...]
 Limits = tuple[Annotated[Number, Ge(-30.0), Le(30.0), Usual(4.0 * pi)], ...]
 Mass = Annotated[Positive, Usual(500.0)]
-# Checks of a URDF.
-LENGTHS: Final = Check.of(Lengths, bare=True)
+LENGTHS: Final = Check.of(Lengths, bare=True)  # of a URDF, as the next ones
 LIMITS: Final = Check.of(tuple[Annotated[Number, Usual(4.0 * pi)], ...], bare=True)
 SPEEDS: Final = Check.of(tuple[JointSpeed, ...], bare=True)
 MASS: Final = Check.of(Mass, bare=True)

@@ -27,7 +27,7 @@ def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process_and_a_l
     for workers in (1, 2):
         table = servobench.compare([Local], settings=SHORT, workers=workers)
         assert table["status"].tolist() == ["completed"]
-        assert ("its runs stay in this one, without limits" in caplog.text) == (workers == 2)
+        assert ("its runs stay here, without limits" in caplog.text) == (workers == 2)
 
 
 BELOW_THE_GUARD = """
