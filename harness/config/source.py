@@ -78,7 +78,7 @@ class SourceFile:
         module.__file__, module.__package__ = str(self.path), ""
         sys.modules[name] = module
         try:
-            with contextlib.chdir(Path.cwd()):  # a file that changes the folder does so for itself only
+            with contextlib.chdir(Path.cwd()):  # the folder is the same after the import
                 exec(compile(self.text, str(self.path), "exec"), vars(module))
         except BaseException as error:
             del sys.modules[name]

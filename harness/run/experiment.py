@@ -416,7 +416,7 @@ def _check_reach(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     """Refuse a target or a curve that no true robot of the run's mismatch can reach, by its farthest point."""
     task, robot = resolved.request.task, find_robot(resolved.request.robot)
     taught = not resolved.task.any_robot  # on the true robot
-    if find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING:  # features of no place
+    if find_task(task).out_of_reach or taught or resolved.request.sensing != DEFAULT_SENSING:  # not all are positions
         return
     nominal, times = robot.nominal, np.linspace(0.0, scenario.duration, POINTS)
     points = np.unique(scenario.reference.at(times), axis=0)
