@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= results/pages
+unexport PYTHONDONTWRITEBYTECODE  # some containers set it, and each of many processes would compile the package anew
 NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
 .PHONY: run check test lowest results nightly golden lint format tables docs release benchmark lock clean
