@@ -1,10 +1,12 @@
 """The public interface: run and compare controllers, by name or as objects, and read results; see `servobench`."""
 
 import operator
+import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, TypeAlias
 
@@ -15,7 +17,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import can_travel
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
-from servobench.harness.batch.plan import Batch, Cell, Grid, check_seeds
+from servobench.harness.batch.plan import MAX_SEEDS, Batch, Cell, Grid, check_seeds, refuse_tuning_seeds
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
 from servobench.harness.config.settings import Settings
@@ -83,6 +85,7 @@ def run(
     with offering():
         place = choose_plant(plant), choose_controller(controller), _task_name(task), read_mismatch(mismatch), seed
         request = RunRequest(*place, robot=robot, sensing=sensing)
+        refuse_tuning_seeds(check_seeds((request.seed,), f"got {seed}"))
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
         return run_experiment(request, given)
@@ -138,8 +141,13 @@ def compare(
     chosen = _seeds(seeds)
     _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings)
     for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
-        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
-            raise ConfigurationError(f"{name} must be a number above 0, got {value!r}")
+        fits = value is None or (isinstance(value, int | float | np.number) and value > 0)
+        _require(fits, name, "a number above 0", value)
+    _require(workers is None or workers % 1 == 0, "workers", "a whole number", workers)
+    _require(isinstance(executor, Executor | None), "executor", "an executor of concurrent.futures", executor)
+    for name, switch in {"isolate": isolate, "resume": resume}.items():
+        _require(isinstance(switch, int | np.bool_ | None), name, "True or False", switch)
+    _require(isinstance(out, str | os.PathLike | None), "out", "the path of a folder", out)
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
@@ -158,15 +166,21 @@ def _seeds(given: object) -> Sequence[int]:
     """Return the seeds of an argument that counts or lists them."""
     if isinstance(given, SupportsIndex) and not getattr(given, "ndim", 0):  # an array has an index, too
         return check_seeds(range(operator.index(given)), f"got {given!r}")
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    if isinstance(given, str | bytes) or not isinstance(given, Iterable):
         raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {given!r}")
-    return check_seeds(tuple(map(read_seed, given)), "see the list that was given")
+    return check_seeds(tuple(map(read_seed, islice(given, MAX_SEEDS + 1))), "see the list that was given")
+
+
+def _require(fits: bool, name: str, wanted: str, came: object) -> None:
+    """Raise a `ConfigurationError` that names an argument unless it is as wanted."""
+    if not fits:
+        raise ConfigurationError(f"{name} must be {wanted}, got {came!r}")
 
 
 def _check_lists(**given: object) -> None:
     """Raise a `ConfigurationError` if one of the arguments is no list, or names nothing."""
     for name, values in given.items():
-        if isinstance(values, str) or not isinstance(values, Sequence):
+        if isinstance(values, str | bytes) or not isinstance(values, Sequence):
             raise ConfigurationError(f"{name} must be a list, such as [{values!r}], got {values!r}")
         if not len(values):
             raise ConfigurationError(f"{name} must name at least one, got none")
@@ -188,6 +202,7 @@ def load(folder: Path | str) -> Results:
     Raises:
         ConfigurationError: not a results folder, or one of another schema.
     """
+    _require(isinstance(folder, str | os.PathLike), "folder", "the path of a folder", folder)
     path = Path(folder)
     runs = results.load_runs(path)
     steps = results.load_steps(path) if results.has_steps(path) else None
@@ -195,4 +210,5 @@ def load(folder: Path | str) -> Results:
 
 
 def _task_name(given: str) -> str:
-    return choose_task(given) if isinstance(given, str) else given  # a request refuses the others
+    _require(isinstance(given, str), "task", "a name", given)
+    return choose_task(given)

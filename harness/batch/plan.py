@@ -88,14 +88,14 @@ def check_seeds(seeds: Sequence[int], came: str) -> Sequence[int]:
         ConfigurationError: none, too many, one negative, too large or named twice.
     """
     if isinstance(seeds, range):
-        first, last = seeds.start, seeds.stop - 1
+        first, last, size = seeds.start, seeds.stop - 1, seeds.stop - seeds.start  # len() ends at 2**63
     else:
-        first, last = min(seeds, default=-1), max(seeds, default=-1)
+        first, last, size = min(seeds, default=-1), max(seeds, default=-1), len(seeds)
     if first < 0 or last < first:
         raise ConfigurationError(f"seeds must name at least one seed, none of them negative; {came}")
     if last > MAX_SEED:
         raise ConfigurationError(f"seeds must be at most {MAX_SEED}, {came}")
-    if len(seeds) > MAX_SEEDS:
+    if size > MAX_SEEDS:
         raise ConfigurationError(f"seeds must name at most {MAX_SEEDS:,}, {came}; use several folders for more")
     for seed, count in Counter(seeds).items() if isinstance(seeds, tuple) else ():
         if count > 1:

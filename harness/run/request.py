@@ -217,13 +217,14 @@ def read_mismatch(text: str) -> Mismatch:
         return Mismatch.parse(text)
 
 
-def read_seed(seed: object) -> int:
+def read_seed(seed: Any) -> int:  # noqa: ANN401 - as a user gave it
     """Return a seed, a whole number from 0 on, as a Python integer, which numpy's integers become.
 
     Raises:
         ConfigurationError: it is no such number.
     """
-    if isinstance(seed, bool) or not hasattr(seed, "__index__") or operator.index(seed) < 0:
+    whole = hasattr(seed, "__index__") and not isinstance(seed, bool) and not getattr(seed, "ndim", 0)
+    if not whole or operator.index(seed) < 0:
         raise ConfigurationError(f"seed must be a non-negative integer, got {seed!r}")
     return operator.index(seed)
 

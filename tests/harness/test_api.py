@@ -4,6 +4,7 @@ import os
 import re
 import sys
 from functools import partial
+from itertools import count
 
 import numpy as np
 import pandas as pd
@@ -77,17 +78,30 @@ RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, 
         (RUN, {"sensing": None}, "sensing must be a name, got None"),
         (RUN, {"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
         (RUN, {"seed": True}, "seed must be a non-negative integer, got True"),
+        (RUN, {"seed": 10_500}, "seed 10500 cannot be used to judge: 10000:20000 are kept for tuning"),
+        (RUN, {"seed": 2**63}, "seeds must be at most 9223372036854775807, got 9223372036854775808"),
         (RUN, {"settings": [1]}, "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]"),
         (RUN, {"settings": {"kinematic": 3}}, "settings must be sections with keys"),
         (COMPARE, {"controllers": "constant"}, "controllers must be a list, such as ['constant'], got 'constant'"),
+        (COMPARE, {"controllers": b"ab"}, "controllers must be a list, such as [b'ab'], got b'ab'"),
         (COMPARE, {"tasks": None}, "tasks must be a list"),
+        (COMPARE, {"tasks": [[]]}, "task must be a name, got []"),
         (COMPARE, {"seeds": "3"}, "seeds must be a number of seeds or a list of them, got '3'"),
         (COMPARE, {"seeds": [2**63]}, "seeds must be at most 9223372036854775807"),
         (COMPARE, {"seeds": 10**9}, "seeds must name at most 1,000,000, got 1000000000"),
+        (COMPARE, {"seeds": 2**63}, "seeds must name at most 1,000,000, got 9223372036854775808"),
+        (COMPARE, {"seeds": count()}, "seeds must name at most 1,000,000, see the list that was given"),
+        (COMPARE, {"seeds": np.ones((1, 2), int)}, "seed must be a non-negative integer, got array([1, 1])"),
         (COMPARE, {"workers": 0}, "workers must be a number above 0, got 0"),
+        (COMPARE, {"workers": 1.5}, "workers must be a whole number, got 1.5"),
+        (COMPARE, {"workers": float("inf")}, "workers must be a whole number, got inf"),
+        (COMPARE, {"executor": 3}, "executor must be an executor of concurrent.futures, got 3"),
+        (COMPARE, {"isolate": "no"}, "isolate must be True or False, got 'no'"),
+        (COMPARE, {"out": 3}, "out must be the path of a folder, got 3"),
         (COMPARE, {"run_timeout": -1}, "run_timeout must be a number above 0, got -1"),
         (COMPARE, {"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
         (COMPARE, {"resume": True}, "resume needs out, the folder to continue in"),
+        (servobench.load, {"folder": 3}, "folder must be the path of a folder, got 3"),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):

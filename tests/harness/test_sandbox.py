@@ -208,7 +208,8 @@ def harm(how: str, tell) -> None:
 )
 def test_a_call_returns_how_its_function_ended(how, end):
     told: list[object] = []
-    ended = sandbox.call(harm, how, Limits(time=3.0), told.append)
+    beyond_count = 1e20  # [bytes], more than the system can limit
+    ended = sandbox.call(harm, how, Limits(3.0, beyond_count, addresses=True), told.append)
     assert told == [["begins", how]]
     assert (ended and (ended.status, ended.reason)) == end
     assert multiprocessing.active_children() == []
