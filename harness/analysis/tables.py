@@ -152,7 +152,8 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     if not pairs and metric is None:
         return []
     if not pairs:
-        raise ConfigurationError(f"--metric {metric} is that by which pairs of controllers are compared; there is one")
+        none = "no two controllers have runs of the same seed"
+        raise ConfigurationError(f"--metric {metric} is for the comparison of pairs, and {none}; leave it out")
     judged = judged_metric(runs)
     metric = judged if metric is None else metric
     filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns

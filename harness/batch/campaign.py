@@ -51,28 +51,28 @@ Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
-NEEDED: Final[Mapping[str, tuple[str, tuple[object, ...]]]] = {  # setting -> another, and its values that leave it idle
-    "aids.latency": ("aids.delay", ("ignored", "identified")),
-    **dict.fromkeys(
-        ("aids.longest_delay", "aids.delay_margin", "aids.score_memory"), ("aids.delay", ("ignored", "given"))
-    ),
-    **dict.fromkeys(("aids.command_delay", "aids.lag"), ("aids.response", ("ignored", "identified"))),
-    "aids.response_length": ("aids.response", ("ignored", "given")),
-    "aids.posture_gain": ("aids.posture", (False,)),
-    "estimator.reset_norm": ("estimator.reset", (False,)),
-    **dict.fromkeys(("estimator.alpha", "estimator.beta", "estimator.kappa"), ("estimator.form", ("split",))),
-    "image_window": ("image", (False,)),
-    "initial.given": ("initial.source", ("nominal", "probe")),
-    **dict.fromkeys(
-        (f"initial.{each}" for each in ("probe_step", "probe_time", "settle_time", "average_time")),
-        ("initial.source", ("nominal", "given")),
-    ),
-    "law.derivative_filter": ("law.derivative_gain", (0.0,)),
-    "mechanics.ripple_order": ("mechanics.ripple", (0.0,)),
-    "mechanics.tool_damping": ("mechanics.tool_frequency", (0.0,)),
-    "sensing.noise_offset": ("sensing.noise", ("white", "stable", "uniform")),
-    "sensing.outlier_size": ("sensing.outliers", (0.0,)),
-}
+NEEDED: Final[Sequence[tuple[tuple[str, ...], Mapping[str, tuple[object, ...]]]]] = (
+    # settings, others that they need, and values of these that leave them idle
+    (("aids.latency",), {"aids.delay": ("ignored", "identified")}),
+    (("aids.longest_delay", "aids.delay_margin", "aids.score_memory"), {"aids.delay": ("ignored", "given")}),
+    (("aids.command_delay", "aids.lag"), {"aids.response": ("ignored", "identified")}),
+    (("aids.response_length",), {"aids.response": ("ignored", "given")}),
+    (("aids.posture_gain",), {"aids.posture": (False,)}),
+    (("aids.damping",), {"aids.feedforward": (False,), "aids.posture": (False,), "aids.limit": ("scale", "clip")}),
+    (("aids.feature_noise",), {"aids.delay": ("ignored",), "aids.response": ("ignored",), "aids.noise": ("given",),
+                               "aids.filter": (False,), "aids.model": ("own",)}),
+    (("estimator.reset_norm",), {"estimator.reset": (False,)}),
+    (("estimator.alpha", "estimator.beta", "estimator.kappa"), {"estimator.form": ("split",)}),
+    (("image_window",), {"image": (False,)}),
+    (("initial.given",), {"initial.source": ("nominal", "probe")}),
+    (("initial.probe_step", "initial.probe_time", "initial.settle_time", "initial.average_time"),
+     {"initial.source": ("nominal", "given")}),
+    (("law.derivative_filter",), {"law.derivative_gain": (0.0,)}),
+    (("mechanics.ripple_order",), {"mechanics.ripple": (0.0,)}),
+    (("mechanics.tool_damping",), {"mechanics.tool_frequency": (0.0,)}),
+    (("sensing.noise_offset",), {"sensing.noise": ("white", "stable", "uniform")}),
+    (("sensing.outlier_size",), {"sensing.outliers": (0.0,)}),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -334,16 +334,16 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
 def _remark_on_idle(settings: Settings, runs: Sequence[ResolvedRun]) -> None:
     """Remark on assignments to settings and variations that count only together with another setting."""
     for section, key, words in _given(settings, [run.request for run in runs]):
-        name, idle = NEEDED.get(key, ("", ()))
+        needed = next((others for keys, others in NEEDED if key in keys), {})
         used = [
-            getattr(run, role)
+            flatten(getattr(run, role))
             for run in runs
             for role in ("plant", "controller")
             if section == getattr(run.request, role) or (section == role and run.request.varies(f"{role}.{key}"))
         ]
-        values = [flatten(config).get(name) for config in used] if name else []
-        if values and all(value in idle for value in values):
-            remark(f"{words} has no effect while {section}.{name} is {values[0]}")
+        if needed and used and all(each.get(name) in idle for each in used for name, idle in needed.items()):
+            found = " and ".join(f"{section}.{name} is {used[0][name]}" for name in needed)
+            remark(f"{words} has no effect while {found}")
 
 
 def _given(settings: Settings, examples: Iterable[RunRequest]) -> list[tuple[str, str, str]]:

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from servobench.controllers.controller import Controller, Delays, RobotKnowledge
+from servobench.controllers.methods import TrainedMethodConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
@@ -125,10 +126,11 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
             part = f"begins at {scenario.evaluate_from:g} s, after the last control instant at {last:g} s"
             raise ConfigurationError(f"its judged part {part}; let evaluate_from be earlier")
         if name not in TASKS:
-            again: Any = task.scenario(setting)
-            starts: list[Any] = [scenario.start, again.start]
-            if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
-                raise ConfigurationError("its scenario differs from one call to the next; draw from setting.seed alone")
+            with configuration_errors("its scenario differs from one call to the next: ", Exception):
+                again: Any = task.scenario(setting)
+                starts: list[Any] = [scenario.start, again.start]
+                if not (np.array_equal(points, again.reference.at(times)) and np.array_equal(*starts)):
+                    raise ConfigurationError("draw from setting.seed alone")
     _check_times(resolved, scenario.duration)
     _check_extents(resolved, setting.nominal)
     return scenario
@@ -324,13 +326,17 @@ def train_networks(
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 
     Raises:
-        ConfigurationError: a name or setting that cannot be used, or a controller without networks.
+        ConfigurationError: a name or setting that cannot be used or changes no network, or a controller without any.
     """
     robot = find_robot(robot_name)
     if not robot.known:
         raise ConfigurationError(f"networks are trained on a nominal model, and controllers know none of {robot.title}")
     request = RunRequest("kinematic", controller, "target", Mismatch(), 0, robot=robot_name, sensing=sensing)
-    experiment = build(resolve(request, settings), progress=progress)  # networks do not depend on plant and task
+    resolved = resolve(request, settings)  # networks do not depend on plant and task
+    for section, key, text in settings.assigned if isinstance(resolved.controller, TrainedMethodConfig) else ():
+        if (section, key.partition(".")[0]) != (controller, "training"):
+            raise ConfigurationError(f"--set {text} has no effect: networks depend on {controller}.training alone")
+    experiment = build(resolved, progress=progress)
     experiment.plant.close()
     if not experiment.networks:
         raise ConfigurationError(f"controller {controller} has no networks to train")

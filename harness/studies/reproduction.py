@@ -1,5 +1,6 @@
 """The reproduction of the paper: carry out its runs, answer its claims, write tables and figures."""
 
+import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -21,7 +22,7 @@ from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import figure_style, method_styles, save_figure
 from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import read_text, write_atomically
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
 FIGURES: Final = "figures"
@@ -140,10 +141,12 @@ def read_answers(path: Path) -> Answers:
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
-    with configuration_errors(f"{path} is not a table of answers: ", OSError, KeyError):
-        table = pd.read_csv(path, dtype=str, keep_default_na=False, comment="#")
-        rows = table[["claim", "plant", "division", "verdict", "evidence"]].itertuples(index=False)
-        return {tuple(key): (verdict, evidence) for *key, verdict, evidence in rows}
+    text, columns = read_text("table of answers", path), ["claim", "plant", "division", "verdict", "evidence"]
+    with configuration_errors(f"{path} is not a table of answers, such as {ANSWERS} of a folder of claims: "):
+        table = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False, comment="#")
+        if lacking := [name for name in columns if name not in table]:
+            raise ConfigurationError(f"it has no column {lacking[0]}")
+    return {tuple(key): (verdict, evidence) for *key, verdict, evidence in table[columns].itertuples(index=False)}
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:

@@ -203,8 +203,10 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     assert differences([replace(answers[0], plant="bullet")], wanted) == [
         "claim 1 on bullet, best equipped: not in the table"
     ]
-    with pytest.raises(ConfigurationError, match="is not a table of answers"):
-        read_answers(tmp_path / "nothing.csv")
+    with pytest.raises(
+        ConfigurationError, match=r"measurements.csv is not a table of answers.*it has no column verdict"
+    ):
+        read_answers(tmp_path / "measurements.csv")
 
 
 def test_an_answer_that_is_another_on_a_second_engine_is_marked():

@@ -30,6 +30,9 @@ ENDS = """from servobench.harness.run.references import FixedPoint
 class Ends(FixedPoint):
     def at(self, time):
         return np.where(np.asarray(time)[..., None] < 1.04, super().at(time), np.nan)
+class Short(FixedPoint):
+    def at(self, time):
+        return super().at(time)[: 29 if np.size(time) == 30 else None]
 """
 WRONG = "from servobench import TaskEntry\nENTRY = TaskEntry('wrong', 'a number', 3)"
 
@@ -109,6 +112,8 @@ def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, 
         (("self.duration / 2)", "self.duration - 0.01)"), ".*begins at 0.99 s, after the last .* at 0.95 s"),
         (("self.duration / 2)", "self.duration / 2, 'point')"), "kind must be one of .*, got 'point'"),
         (("self.radius * times", "np.random.random() * times"), "its scenario differs from one call to the next"),
+        (("        times =", "        type(self).once = 1 / (not hasattr(self, 'once'))\n        times ="),
+         "its scenario differs from one call to the next: division by zero"),
     ],
 )  # fmt: skip
 def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, change, words):
@@ -117,9 +122,15 @@ def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, chang
         servobench.run("constant", task="./spiral.py")
 
 
-def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controller(tmp_path):
-    write(tmp_path, ENDS + SPIRAL.replace("Waypoints(times, points)", "Ends(np.zeros(3))"), "spiral.py")
-    words = r"the reference of the task must be finite .*got \[nan, nan, nan\] at 1.05 s"
+@pytest.mark.parametrize(
+    ("reference", "words"),
+    [
+        ("Ends", r"the reference of the task must be finite .*got \[nan, nan, nan\] at 1.05 s"),
+        ("Short", r"the reference of the task must have a row for each of 30 times, got shape \(29, 3\)"),
+    ],
+)
+def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controller(tmp_path, reference, words):
+    write(tmp_path, ENDS + SPIRAL.replace("Waypoints(times, points)", f"{reference}(np.zeros(3))"), "spiral.py")
     assert re.search(words, servobench.run("constant", task="./spiral.py").row["reason"])
     request = RunRequest("kinematic", "constant", choose_task("./spiral.py"), "moderate", 0)
     with pytest.raises(ConfigurationError, match=f"task Spiral: {words}"), offering():
