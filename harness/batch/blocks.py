@@ -152,8 +152,7 @@ def carry_out_blocks(
 def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> tuple[list[RunResult], list[Block]]:
     """Return the results of the first runs of a block, and in blocks the runs that are still to be carried out."""
     try:
-        told = future.result()
-        answer = told if isinstance(told, Answer) else Answer(json.loads(zlib.decompress(told)))
+        answer = _received(future)
     except workers.lost:
         answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
     match answer.items:
@@ -177,6 +176,12 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     return [*done, _failed(block.jobs[at], end.ending)], rest
 
 
+def _received(future: Future[Answer | bytes]) -> Answer:
+    """Return the answer of a worker, which comes from elsewhere as one compressed block."""
+    told = future.result()
+    return told if isinstance(told, Answer) else Answer(json.loads(zlib.decompress(told)))
+
+
 def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
     """Return the task of a block; files of users are loaded first, so that the classes of their settings are found."""
     sources = tuple(each.source for each in block.own if each.source is not None)
@@ -195,7 +200,7 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
 
     Args:
         block: one run.
-        submit: of workers that are processes of this machine.
+        submit: of workers.
         progress: called with the finished share of a training of networks.
 
     Raises:
@@ -212,7 +217,8 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
             case str(refusal):
                 refused.append(refusal)
 
-    submit(_task(_build, block), hear).result()
+    for item in _received(submit(_task(_build, block), hear)).items:  # of workers elsewhere, whose answers come at once
+        hear(item)
     if refused:
         raise ConfigurationError(refused[0])
 
@@ -477,7 +483,7 @@ def _workers_of(executor: Executor, count: int, lost: tuple[type[BaseException],
     """Return the workers of an executor; `lost` are the errors of its futures whose process died."""
     if isinstance(executor, ThreadPoolExecutor):
         raise ConfigurationError("an executor must have processes: threads would share the state of solvers and files")
-    return Workers(lambda task: executor.submit(_gather, task), count, cluster=True, lost=lost)
+    return Workers(lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost)
 
 
 def _gather(task: Task) -> bytes:

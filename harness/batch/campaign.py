@@ -6,6 +6,7 @@ out the runs without a part, so that its tables are those of an undisturbed one,
 when they are needed, so that the memory of this process does not grow with their number.
 """
 
+import contextlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -214,8 +215,9 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     _remark_on_idle(campaign.settings, [select(request, sections) for request in runs.examples])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
-        if job.owner and place.submit is not None and not place.cluster:
-            build_block(Block((job,), offered(runs.sections)), place.submit, observer.training)
+        if job.owner and place.submit is not None:
+            with contextlib.suppress(*place.lost):  # the run will say so
+                build_block(Block((job,), offered(runs.sections)), place.submit, observer.training)
         else:
             build_once(job.run, observer.training)
     return sections

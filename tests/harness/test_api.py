@@ -32,18 +32,22 @@ def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process_and_a_l
 
 
 BELOW_THE_GUARD = """
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 import servobench
 from kit.resting import Resting
 
 if __name__ == "__main__":
     class Mine(Resting):
         pass
-    servobench.compare([Mine], isolate=True)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        servobench.compare([Mine], isolate=True)
 """
 
 
-def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(tmp_path):
-    (tmp_path / "script.py").write_text(BELOW_THE_GUARD)
+@pytest.mark.parametrize("place", ["isolate=True", "executor=pool"])
+def test_a_controller_that_workers_do_not_find_below_the_guard_of_a_script_is_refused_with_the_remedy(tmp_path, place):
+    (tmp_path / "script.py").write_text(BELOW_THE_GUARD.replace("isolate=True", place))
     remedy = "define it above `if __name__ == '__main__':`"
     line = python("script.py", path=tmp_path, PYTHONPATH=os.pathsep.join(sys.path)).stderr.splitlines()[-1]
     assert "a worker process lacks a class: Can't get attribute 'Mine'" in line
