@@ -15,7 +15,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason, write_atomically, write_csv
+from servobench.plant.contract.files import write_atomically, write_csv, writing
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
@@ -44,12 +44,10 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
         check_installed((MCAP,), "the format mcap")
     runs = results.load_runs(folder)
     results.check_steps(folder)
-    try:
+    with writing(out):
+        if out.exists():
+            raise ConfigurationError(f"{out} exists already; name a new folder")
         out.mkdir(parents=True)
-    except FileExistsError:
-        raise ConfigurationError(f"{out} exists already; name a new folder") from None
-    except OSError as error:
-        raise ConfigurationError(f"{out} cannot be written: {reason(error)}") from error
     try:
         return _write_runs(folder, runs, out, kind)
     except BaseException:

@@ -20,7 +20,7 @@ from typing import Final, Self
 
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import PARTIAL, harmless
+from servobench.plant.contract.files import PARTIAL, harmless, writing
 
 LOCK = ".lock"
 PARTS: Final = "parts"
@@ -97,11 +97,9 @@ def locked(folder: Path) -> Iterator[Lock]:
     """
     path = folder / LOCK
     refuse_links(folder)
-    try:
+    with writing(folder, "results folder"):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, stale = _acquire(path)
-    except OSError as error:
-        raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
     try:
         with contextlib.suppress(OSError):  # a full disk does not keep the lock from being held
             if os.fstat(descriptor).st_nlink == 1:  # otherwise it is also a file elsewhere
@@ -174,10 +172,8 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     if any("\ud800" <= letter <= "\udfff" for letter in str(folder)):
         encoding = sys.getfilesystemencoding()
         raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; name another one with --out")
-    try:
+    with writing(folder, "results folder"):
         taken = not is_unused(folder)
-    except OSError as error:
-        raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
     if taken:
         resume = ", or continue its batch with --resume" if can_resume and folder.is_dir() else ""
         raise ConfigurationError(f"results folder {folder} exists already; name another one with --out{resume}")

@@ -17,9 +17,9 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option, switch
-from servobench.harness.cli.terminal import FAILED, console, print_tables, say, writing
+from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import user_path, write_atomically, write_csv
+from servobench.plant.contract.files import user_path, write_atomically, write_csv, writing
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -14,8 +14,9 @@ import typer
 from servobench.fmus.compiler import Platform, parse_platforms
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
-from servobench.harness.cli.terminal import FAILED, print_rows, say, writing
+from servobench.harness.cli.terminal import FAILED, print_rows, say
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.files import writing
 
 if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings

@@ -12,9 +12,9 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import JsonOption
-from servobench.harness.cli.terminal import console, print_json, say, writing
+from servobench.harness.cli.terminal import console, print_json, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically
+from servobench.plant.contract.files import write_atomically, writing
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word

@@ -11,8 +11,9 @@ import typer
 
 from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say, writing
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import writing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

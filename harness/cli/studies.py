@@ -11,7 +11,7 @@ import typer
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.results import judge, say_aids
-from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say, writing
+from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 
 if TYPE_CHECKING:
@@ -341,7 +341,7 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.contract.files import write_csv
+    from servobench.plant.contract.files import write_csv, writing
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []

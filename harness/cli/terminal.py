@@ -9,14 +9,12 @@ import signal
 import sys
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
-from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
 
-from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import harmless, reason
+from servobench.plant.contract.files import harmless
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,15 +44,6 @@ class Terminal(Console):
 if os.environ.get("COLUMNS", "").strip("0") == "":  # as some programs tell their children: no line would be printed
     os.environ.pop("COLUMNS", None)
 console = Terminal(emoji=False)  # `pixel:hand:` is none
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Refuse a file or a folder that cannot be written within the context."""
-    try:
-        yield
-    except OSError as error:
-        raise ConfigurationError(f"{error.filename or path} cannot be written: {reason(error)}") from error
 
 
 @contextlib.contextmanager

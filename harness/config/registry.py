@@ -187,10 +187,8 @@ def _load(registry: Registry[Any], name: str) -> Any:  # noqa: ANN401 - an entry
         raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {describe_at(error)}") from error
     if own is not None:
         return given
-    try:
+    with configuration_errors(f"{kind} {name!r} ({point.value}) cannot be used: "):
         return registry.kind.make_entry(given, point.value, name)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be used: {error}") from error
 
 
 def _mapped_plant(name: str) -> PlantEntry | None:

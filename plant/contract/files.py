@@ -6,7 +6,8 @@ import io
 import os
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -39,6 +40,16 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path | None, kind: str = "") -> Iterator[None]:
+    """Raise a `ConfigurationError` where a file or folder of a kind, or by default a file in it, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        named = f"{kind} {path}" if kind else error.filename or path
+        raise ConfigurationError(f"{named} cannot be written: {reason(error)}") from error
 
 
 def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not be imported here

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.files import writing
 from servobench.plant.fmu.description import FmuDescription
 
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
@@ -86,10 +87,8 @@ class MessageLog:
             ValueError: the file cannot be written.
         """
         self._name, self._file = name, file
-        try:
+        with writing(file, "debug_log"):
             self._append(f"an instance of {name}")
-        except OSError as error:
-            raise ValueError(f"debug_log {file} cannot be written: {error.strerror}") from error
         self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
 
     def add(self, status: int, message: str) -> None:
