@@ -220,8 +220,7 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
     if config.source == "given":
         lengths = [len(row) for row in config.given]
         if lengths != [spec.n] * spec.m:
-            wanted = f"{spec.m} rows of {spec.n} entries for initial.source 'given'"
-            raise ValueError(f"initial.given must hold {wanted}, got {len(lengths)} rows of length {lengths}")
+            raise ValueError(f"initial.given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}")
         given = np.array(config.given)
         return KnownJacobian(lambda q: np.broadcast_to(given, (*q.shape[:-1], *given.shape)), spec)
     if model is None:

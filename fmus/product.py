@@ -27,7 +27,7 @@ from servobench.fmus.model_description import (
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.fmus.sources import layout_header
 from servobench.fmus.variables import Layout
-from servobench.plant.contract.files import write_atomically, writing
+from servobench.plant.contract.files import accessing, write_atomically
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
 HEADERS: Final = {
@@ -186,5 +186,5 @@ def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "model
                 entry.external_attr = 0o644 << 16
                 archive.writestr(entry, contents[inside], compresslevel=9)
 
-    with writing(path):
+    with accessing(path):
         write_atomically(path, write)

@@ -15,7 +15,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically, write_csv, writing
+from servobench.plant.contract.files import accessing, write_atomically, write_csv
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
@@ -44,7 +44,7 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
         check_installed((MCAP,), "the format mcap")
     runs = results.load_runs(folder)
     results.check_steps(folder)
-    with writing(out):
+    with accessing(out):
         if out.exists():
             raise ConfigurationError(f"{out} exists already; name a new folder")
         out.mkdir(parents=True)

@@ -152,8 +152,7 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None) -> list[Row]:
     if not pairs and metric is None:
         return []
     if not pairs:
-        none = "no two controllers have runs of the same seed"
-        raise ConfigurationError(f"--metric {metric} is for the comparison of pairs, and {none}; leave it out")
+        raise ConfigurationError(f"no two controllers have runs of one seed to compare; leave --metric {metric} out")
     judged = judged_metric(runs)
     metric = judged if metric is None else metric
     filled = runs.select_dtypes("number").dropna(axis=1, how="all").columns

@@ -52,8 +52,7 @@ Row = dict[str, Any]
 _MakeJobs = Callable[[Iterable[int]], Iterator[Job]]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that identify its runs
 SOURCES: Final = (*OWN.values(), "plugins")  # entries that have the hash of code by its name
-NEEDED: Final[Sequence[tuple[tuple[str, ...], Mapping[str, tuple[object, ...]]]]] = (
-    # settings, others that they need, and values of these that leave them idle
+NEEDED: Final = (  # settings, others that they need, and values of these that leave them idle
     (("aids.latency",), {"aids.delay": ("ignored", "identified")}),
     (("aids.longest_delay", "aids.delay_margin", "aids.score_memory"), {"aids.delay": ("ignored", "given")}),
     (("aids.command_delay", "aids.lag"), {"aids.response": ("ignored", "identified")}),
@@ -336,7 +335,7 @@ def check_effects(settings: Settings, examples: Sequence[RunRequest], *, steps: 
 def _remark_on_idle(settings: Settings, runs: Sequence[ResolvedRun]) -> None:
     """Remark on assignments to settings and variations that count only together with another setting."""
     for section, key, words in _given(settings, [run.request for run in runs]):
-        needed = next((others for keys, others in NEEDED if key in keys), {})
+        needed: Mapping[str, tuple[object, ...]] = next((others for keys, others in NEEDED if key in keys), {})
         used = [
             flatten(getattr(run, role))
             for run in runs

@@ -20,7 +20,7 @@ from typing import Final, Self
 
 from servobench.plant.contract.checksums import SUMS
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import PARTIAL, harmless, writing
+from servobench.plant.contract.files import PARTIAL, accessing, harmless
 
 LOCK = ".lock"
 PARTS: Final = "parts"
@@ -97,7 +97,7 @@ def locked(folder: Path) -> Iterator[Lock]:
     """
     path = folder / LOCK
     refuse_links(folder)
-    with writing(folder, "results folder"):
+    with accessing(folder, "results folder"):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, stale = _acquire(path)
     try:
@@ -172,7 +172,7 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     if any("\ud800" <= letter <= "\udfff" for letter in str(folder)):
         encoding = sys.getfilesystemencoding()
         raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; name another one with --out")
-    with writing(folder, "results folder"):
+    with accessing(folder, "results folder"):
         taken = not is_unused(folder)
     if taken:
         resume = ", or continue its batch with --resume" if can_resume and folder.is_dir() else ""

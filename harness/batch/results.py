@@ -29,7 +29,7 @@ from servobench.harness.config.description import plain
 from servobench.harness.run.result import NETWORKS, RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import PARTIAL, write_atomically
+from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
 
 if TYPE_CHECKING:
     from servobench.plant.bench.plant import ImageArray
@@ -49,14 +49,12 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
         ConfigurationError: the folder has something in it, or cannot be made.
     """
     check_empty(folder)
-    try:
+    with accessing(folder, "results folder", "made"):
         (folder / PARTS).mkdir(parents=True, exist_ok=True)
         for path in folder.iterdir():
             if path.name == SUMS or PARTIAL.fullmatch(path.name):
                 path.unlink()
         write_manifest(folder, manifest)
-    except OSError as error:
-        raise ConfigurationError(f"results folder {folder} cannot be made: {error.strerror}") from error
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

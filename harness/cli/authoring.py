@@ -19,7 +19,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, PLANT, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import user_path, write_atomically, write_csv, writing
+from servobench.plant.contract.files import accessing, user_path, write_atomically, write_csv
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -68,7 +68,7 @@ def new(
         raise ConfigurationError(
             f"a Python package is called {module}, which a file of this name would hide; take another"
         )
-    with writing(folder):
+    with accessing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
             text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
@@ -143,7 +143,7 @@ def shadow(
         seen = see(resolved, table)
     name, apart, ahead = resolved.request.controller, differences(seen), predictions(seen)
     if out is not None:
-        with writing(out):
+        with accessing(out):
             write_csv(seen, out)
         say(f"table in {out}")
     elif apart.empty and ahead.empty:
@@ -203,7 +203,7 @@ def identify(
     for line in remarks(rows, found, response):
         say(line)
     if out is not None:
-        with writing(out):
+        with accessing(out):
             folder = out.resolve().parent  # where the twin looks for files first
             named = with_files(
                 request.robot,

@@ -16,7 +16,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, command, named_option, option
 from servobench.harness.cli.terminal import FAILED, print_rows, say
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import writing
+from servobench.plant.contract.files import accessing
 
 if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
@@ -43,7 +43,7 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        with configuration_errors(), writing(Path(tempfile.gettempdir())):
+        with configuration_errors(), accessing(Path(tempfile.gettempdir())):
             yield parse_platforms(self.platforms)
 
     def request(self, controller: str, settings: Settings) -> RunRequest:

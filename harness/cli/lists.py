@@ -14,7 +14,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically, writing
+from servobench.plant.contract.files import accessing, write_atomically
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
@@ -109,7 +109,7 @@ def init(
         return
     if file.exists():
         raise ConfigurationError(f"{file} exists already and is left as it is; name another file")
-    with writing(file):
+    with accessing(file):
         write_atomically(file, lambda new: new.write_text(text, encoding="utf-8"))
     say(f"{file}: {', '.join(sections)}")
 

@@ -13,7 +13,7 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import writing
+from servobench.plant.contract.files import accessing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -126,7 +126,7 @@ def figures(
     say(results.describe_missing(folder))
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
-    with console.status("drawing the figures"), writing(target):
+    with console.status("drawing the figures"), accessing(target):
         files: list[Path] = []
         for named in folder_figures(folder, choice):
             files += save_figure(named.figure, target / named.stem, formats, exact_width=True)

@@ -341,7 +341,7 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.contract.files import write_csv, writing
+    from servobench.plant.contract.files import accessing, write_csv
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
@@ -358,7 +358,7 @@ def analyse(
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    with writing(out):
+    with accessing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_csv(table, out / TABLE)
         text = printed(table)

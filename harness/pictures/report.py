@@ -32,7 +32,7 @@ from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import write_atomically, writing
+from servobench.plant.contract.files import accessing, write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
@@ -83,7 +83,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         raise ConfigurationError(f"{folder} holds no finished run")
     target = path or folder / NAME
     page = _page(folder, runs)
-    with writing(target, "report"):
+    with accessing(target, "report"):
         write_atomically(target, lambda file: file.write_text(page, encoding="utf-8"))
     return target
 

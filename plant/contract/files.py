@@ -43,13 +43,13 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
-def writing(path: Path | None, kind: str = "") -> Iterator[None]:
-    """Raise a `ConfigurationError` where a file or folder of a kind, or by default a file in it, cannot be written."""
+def accessing(path: Path | None, kind: str = "", done: str = "written") -> Iterator[None]:
+    """Raise a `ConfigurationError` where a file or folder of a kind, or by default a file in it, cannot be `done`."""
     try:
         yield
     except OSError as error:
         named = f"{kind} {path}" if kind else error.filename or path
-        raise ConfigurationError(f"{named} cannot be written: {reason(error)}") from error
+        raise ConfigurationError(f"{named} cannot be {done}: {reason(error)}") from error
 
 
 def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not be imported here
@@ -82,12 +82,11 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 
 def read_text(kind: str, path: Path) -> str:
     """Return the text of a file without the byte-order mark that some editors begin it with; see `read_toml`."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{kind} {path} is no text in UTF-8; save it in this encoding") from error
-    except OSError as error:
-        raise ConfigurationError(f"{kind} {path} cannot be read: {reason(error)}") from error
+    with accessing(path, kind, "read"):
+        try:
+            return path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise ConfigurationError(f"{kind} {path} is no text in UTF-8; save it in this encoding") from error
 
 
 def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as above

@@ -13,6 +13,8 @@ from typing import Final
 
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.checksums import digest
+from servobench.plant.contract.faults import configuration_errors
+from servobench.plant.contract.files import accessing
 
 DESCRIPTION: Final = "modelDescription.xml"
 MAX_FILES: Final = 20_000  # number of files in an archive
@@ -35,20 +37,16 @@ def extract_fmu(path: Path) -> Path:
         ValueError: no such file, not a zip archive, an archive that is damaged, climbs out of its folder, or unpacks to
             more than the limits of this module, or one without a model description.
     """
-    try:
+    with accessing(path, "fmu file", "read"):
         if not path.is_file():
             raise ValueError(f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}")
         key = digest(path)[:32]
-    except OSError as error:
-        raise ValueError(f"fmu file {path} cannot be read: {error.strerror}") from error
     return cached("extracted", key, lambda folder: _extract(path, folder))
 
 
 def _extract(path: Path, folder: Path) -> None:
-    try:
+    with configuration_errors(f"fmu file {path} is not a zip archive: ", *DAMAGES):
         archive = zipfile.ZipFile(path)
-    except DAMAGES as error:
-        raise ValueError(f"fmu file {path} is not a zip archive: {error}") from error
     with archive:
         entries = archive.infolist()
         _check_names(path, entries)

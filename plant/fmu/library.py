@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from servobench.plant.contract.faults import FmuError
-from servobench.plant.contract.files import writing
+from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
@@ -87,7 +87,7 @@ class MessageLog:
             ValueError: the file cannot be written.
         """
         self._name, self._file = name, file
-        with writing(file, "debug_log"):
+        with accessing(file, "debug_log"):
             self._append(f"an instance of {name}")
         self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
 

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.contract.files import accessing, read_toml, user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
@@ -64,10 +64,8 @@ def find_robot(text: str) -> Robot:
 
 def _changed(kind: str, path: Path) -> int:
     """Return when a file was changed [ns]."""
-    try:
+    with accessing(path, f"{kind} file", "read"):
         return path.stat().st_mtime_ns
-    except OSError as error:
-        raise ValueError(f"{kind} file {path} cannot be read: {error.strerror}") from error
 
 
 def with_files(text: str, change: Callable[[str], str]) -> str:

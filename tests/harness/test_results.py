@@ -55,7 +55,7 @@ def folder(tmp_path):
 
 def test_a_metric_of_pairs_is_refused_where_there_is_one_controller():
     alone = pd.DataFrame([made_up_row(f"run{seed}", seed=seed) for seed in range(2)])
-    with pytest.raises(ConfigurationError, match="no two controllers have runs of the same seed; leave it out"):
+    with pytest.raises(ConfigurationError, match="no two controllers have runs of one seed to compare; leave --metric"):
         list(statistics_rows(alone, "settling_time_s"))
     ((_, controllers, pairs),) = statistics_rows(alone)
     assert (len(controllers), pairs) == (1, [])

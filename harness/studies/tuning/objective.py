@@ -44,7 +44,7 @@ from servobench.harness.run.resolution import ResolvedRun, Sections, resolve_sec
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.tuning.spaces import find_tunable
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
-from servobench.plant.contract.files import writing
+from servobench.plant.contract.files import accessing
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, Periods, settings
@@ -273,7 +273,7 @@ class Ledger:
     def add(self, settings: Mapping[str, Any], costs: Sequence[float]) -> None:
         """Write the costs of the runs under nested settings down."""
         lines = [self._fingerprint] * (not self._size) + [{"settings": settings, "costs": list(costs)}]
-        with writing(self.path, "study"), self.path.open("ab") as file:
+        with accessing(self.path, "study"), self.path.open("ab") as file:
             file.truncate(self._size)
             file.write("".join(f"{json.dumps(line)}\n" for line in lines).encode())
             file.flush()
