@@ -51,8 +51,7 @@ class Reference(ABC):
         """
         rows = np.array(self.at(np.arange(count) * period), dtype=np.float64)
         if rows.shape[:-1] != (count,):
-            wanted = f"the reference of the task must have a row for each of {count} times"
-            raise ConfigurationError(f"{wanted}, got shape {rows.shape}")
+            raise ConfigurationError(f"the task's reference needs a row for each of {count} times, got {rows.shape}")
         if not (finite := np.isfinite(rows).all(axis=-1)).all():
             first = int(finite.argmin())
             wanted = "the reference of the task must be finite over the run and beyond it, as far as it is previewed"

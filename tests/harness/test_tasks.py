@@ -126,7 +126,7 @@ def test_a_task_that_returns_something_else_is_refused_in_a_line(tmp_path, chang
     ("reference", "words"),
     [
         ("Ends", r"the reference of the task must be finite .*got \[nan, nan, nan\] at 1.05 s"),
-        ("Short", r"the reference of the task must have a row for each of 30 times, got shape \(29, 3\)"),
+        ("Short", r"the task's reference needs a row for each of 30 times, got \(29, 3\)"),
     ],
 )
 def test_a_reference_without_numbers_beyond_its_end_is_no_fault_of_the_controller(tmp_path, reference, words):
