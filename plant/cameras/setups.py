@@ -45,7 +45,8 @@ Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
 DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
-CHECKED: Final = 1e-3  # the same where `rates` are checked: longer, so that single precision does
+CHECKED: Final = 1e-3  # the same for a `measure` in single precision, and where `rates` are checked
+FLOATS: Final = (np.float64, np.float32)  # that `measure` and `rates` may return
 POSES: Final = 5  # of the target, at which the functions of a user's set-up are checked
 RATE_TOLERANCE: Final = 1e-3  # [1] of the fastest rate, by which `rates` may differ from the derivative
 
@@ -91,6 +92,8 @@ class SensingSetup:
 
     def __post_init__(self) -> None:
         """Check names and scale."""
+        if not self.features:
+            raise ValueError(f"sensing {self.name}: features must be one name or more, got none")
         if self.scale is None and self.unit not in EXTENTS:
             wanted = "scale=lambda focal, distance: NUMBER, by how much they change with a metre of motion"
             raise ValueError(f"sensing {self.name}: features in {self.unit} need their natural size; give {wanted}")
@@ -118,44 +121,66 @@ class SensingSetup:
 
     def change(self, points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
         """Return how features of points (..., c, p, 3) change, (..., m, n), with motions (..., c, p, 3, n) [m]."""
-        return (self.rates or self._differences)(points, motions, optics)
+        if self.rates is not None:
+            return self.rates(points, motions, optics)
+        return self._differences(points, motions, optics, self._step)
 
-    def _differences(
-        self, points: FloatArray, motions: FloatArray, optics: Optics, h: float = DIFFERENCE
-    ) -> FloatArray:
+    def _differences(self, points: FloatArray, motions: FloatArray, optics: Optics, h: float) -> FloatArray:
         step = h * np.moveaxis(motions, -1, 0)
         there, back = self.measure(points + step, optics), self.measure(points - step, optics)
         return np.ascontiguousarray(np.moveaxis((there - back) / (2.0 * h), 0, -1))
 
+    @cached_property
+    def _step(self) -> float:
+        """Share of the motions for `_differences`, by the precision in which `measure` computes."""
+        fine, coarse = (self._differences(*self._places(), h) for h in (DIFFERENCE, CHECKED))
+        return DIFFERENCE if np.abs(fine - coarse).max() <= RATE_TOLERANCE * np.abs(coarse).max() else CHECKED
+
+    def _places(self) -> tuple[FloatArray, FloatArray, Optics]:
+        """Return a few places of the target in front of the cameras, two motions of it, and the optics; see `rates`."""
+        draw = np.random.default_rng(0).uniform
+        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [0.1, 0.0, 0.0]
+        points = np.array(self.target) + beside + draw(-0.05, 0.05, (POSES, 1, 1, 3))
+        moved, turned = draw(-1.0, 1.0, (2, POSES, 1, 1, 3, 2))  # of a rigid target
+        motions = moved + np.cross(turned, np.array(self.target)[..., None], axis=-2)
+        return points, np.zeros((*points.shape, 2)) + motions, ideal_optics(CAMERA, self.cameras)
+
+    @np.errstate(divide="raise", over="raise", invalid="raise")
     def check(self) -> None:
         """Refuse functions that break their contract, at a few places of the target in front of the cameras.
 
         Raises:
             ConfigurationError: they change their arguments, `measure` does not return m features for each place, or
                 `rates` is not its derivative.
+            FloatingPointError: they divide by zero, or the like.
         """
-        draw, places = np.random.default_rng(0).uniform, (POSES, self.cameras, len(self.target), 3)
-        beside = np.array([0.0, 0.0, 1.0]) - np.arange(self.cameras)[:, None, None] * [0.1, 0.0, 0.0]
-        points = np.array(self.target) + beside + draw(-0.05, 0.05, (POSES, 1, 1, 3))
-        moved, turned = draw(-1.0, 1.0, (2, POSES, 1, 1, 3, 2))  # of a rigid target
-        motions = np.zeros((*places, 2)) + moved + np.cross(turned, np.array(self.target)[..., None], axis=-2)
-        optics = ideal_optics(CAMERA, self.cameras)
+        points, motions, optics = self._places()
         given = points.copy(), motions.copy()
-        made = {"measure": self.measure(given[0], optics), "rates": self.change(*given, optics)}
+        self._check_array("measure", self.measure(points[0].copy(), optics), (self.m,), points[0])
+        self._check_array("measure", self.measure(given[0], optics), (POSES, self.m), points)
+        rates = self.change(*given, optics)
+        self._check_array("rates", rates, (POSES, self.m, 2), points)
         if not (np.array_equal(given[0], points) and np.array_equal(given[1], motions)):
             wanted = "must not change their arguments; work on a copy, such as points.copy()"
             raise ConfigurationError(f"sensing {self.name}: measure and rates {wanted}")
-        for (name, values), shape in zip(made.items(), ((POSES, self.m), (POSES, self.m, 2)), strict=True):
-            if np.shape(values) != shape:
-                came = f"shape {shape} for points {places}, got {np.shape(values)}; index them as points[..., 0, 0, :]"
-                raise ConfigurationError(f"sensing {self.name}: {name} must return {came}")
         differences = self._differences(points, motions, optics, CHECKED)
-        wrong = np.abs(made["rates"] - differences).max(axis=(0, 2))
+        wrong = np.abs(rates - differences).max(axis=(0, 2))
         if self.rates is not None and not (wrong <= RATE_TOLERANCE * np.abs(differences).max()).all():
             raise ConfigurationError(
                 f"sensing {self.name}: rates is not the derivative of measure, by up to {wrong.max():.3g} "
                 f"{self.unit}/m for {self.features[wrong.argmax()]}; correct it, or leave it out for differences"
             )
+
+    def _check_array(self, name: str, made: object, shape: tuple[int, ...], points: FloatArray) -> None:
+        """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
+        if not isinstance(made, np.ndarray) or made.shape != shape or made.dtype not in FLOATS:
+            came = f"{made.dtype} of shape {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
+            wanted = (
+                f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :], got {came}"
+            )
+            raise ConfigurationError(f"sensing {self.name}: {name} must return {wanted}")
+        if not np.isfinite(made).all():
+            raise ConfigurationError(f"sensing {self.name}: {name} must return finite numbers, got {made.tolist()}")
 
     def valid(self, found: BoolArray) -> BoolArray:
         """Return which features are measured, (..., m), where the points (..., c, p) are found or not."""

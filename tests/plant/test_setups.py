@@ -242,9 +242,16 @@ def in_place(points, optics):
         ({"measure": in_place, "rates": None}, "measure and rates must not change their arguments; work on a copy"),
         (
             {"measure": lambda points, _: points[0, 0, :2]},
-            r"measure must return shape \(5, 2\) for points \(5, 1, 1, 3\), got \(1, 3\)",
+            r"measure must return .* of shape \(5, 2\) for points \(5, 1, 1, 3\), .* got float64 of shape \(1, 3\)",
         ),
-        ({"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]}, r"rates must return shape \(5, 2, 2\) for"),
+        ({"measure": lambda points, _: points[..., 0, 0, :2].tolist()}, "measure must return .*, got list"),
+        (
+            {"measure": lambda points, _: points[..., 0, 0, :2].astype(np.float16)},
+            "measure must return .*, got float16",
+        ),
+        ({"features": ()}, "features must be one name or more, got none"),
+        ({"measure": lambda points, _: np.nan * points[..., 0, 0, :2]}, "measure must return finite numbers, got .nan"),
+        ({"rates": lambda points, motions, _: motions[..., 0, 0, 0, :]}, r"rates must return .* shape \(5, 2, 2\) for"),
         ({"rates": lambda *given: 1.01 * SETUPS["pixel"].rates(*given)}, "rates is not the derivative of measure"),
     ],
 )
@@ -253,6 +260,8 @@ def test_functions_that_break_their_contract_are_refused(changes, message):
         replace(SETUPS["pixel"], **changes).check()
     for setup in SETUPS.values():
         setup.check()
+    with pytest.raises(FloatingPointError, match="invalid value"):
+        replace(SETUPS["pixel"], measure=lambda points, _: np.log(points[..., 0, 0, :2] - 9.0)).check()
 
 
 def test_lengths_have_a_natural_size_and_other_units_need_one_and_single_features_a_point():
@@ -271,6 +280,7 @@ def test_features_without_a_derivative_are_differentiated():
     points = rng.normal(size=(4, 1, 1, 3)) * 0.2 + [0.0, 0.0, 1.0]
     motions = rng.normal(size=(4, 1, 1, 3, 6))
     optics = Optics(np.array([200.0]), np.array([[160.0, 120.0]]), np.array([0.05]), (320.0, 240.0))
-    np.testing.assert_allclose(
-        numeric.change(points, motions, optics), exact.change(points, motions, optics), rtol=1e-6, atol=1e-5
-    )
+    wanted = exact.change(points, motions, optics)
+    np.testing.assert_allclose(numeric.change(points, motions, optics), wanted, rtol=1e-6, atol=1e-5)
+    single = replace(numeric, measure=lambda *given: exact.measure(*given).astype(np.float32))
+    assert np.abs(single.change(points, motions, optics) - wanted).max() < 1e-3 * np.abs(wanted).max()
