@@ -67,7 +67,7 @@ def naming(conditions: str) -> Iterator[None]:
         yield
     except Exception as error:
         if conditions:
-            error.args = (f"{error}; this happens with {conditions}",)
+            error.add_note(f"; this happens with {conditions}")
         raise
 
 
@@ -110,13 +110,16 @@ def _finding(check: Check) -> Finding:
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             note = check.carry_out()
-    except (CheckFailed, ConfigurationError) as error:
-        return Finding(check.name, "failed", str(error))
-    except WrongAnswer as error:
-        return Finding(check.name, "failed", f"{at(error.method)}: {error}")
     except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
-        return Finding(check.name, "failed", describe_at(error) + _remedy(error))
+        conditions = "".join(getattr(error, "__notes__", ()))
+        return Finding(check.name, "failed", _defect(error) + conditions + _remedy(error))
     return Finding(check.name, "note", note) if note else Finding(check.name, "ok")
+
+
+def _defect(error: BaseException) -> str:
+    if isinstance(error, WrongAnswer):
+        return f"{at(error.method)}: {error}"
+    return str(error) if isinstance(error, CheckFailed | ConfigurationError) else describe_at(error)
 
 
 def at(method: Any) -> str:  # noqa: ANN401 - a method or a function

@@ -177,6 +177,12 @@ OTHER = "; this happens with a period of 100 ms and the robot panda"
         (MOVING, f"{MOVING} * np.sign(self.q[1])", "run: q0 moves by 0.05 rad under commands for -0.05 rad"),
         (MOVING, f"3.0 * {MOVING}", "run: q0 moves by -0.15 rad under"),
         (MOVING, "0.05 * joint_velocity", f"run: q0 moves by -0.025 rad {OTHER}"),
+        (MOVING, f"{MOVING} * {{6: 1.0}}[len(self.q)]", f"KeyError: 7{OTHER}"),
+        (
+            '"x", "y", "z"',
+            '"u", "v"',
+            "run: spec has the features u, v in m, and the camera of the setup has x, y, z in m",
+        ),
         (SEEN, SEEN.replace("\n", "[[1, 0, 2]]\n", 1), "truth: at rest truth().feature is ["),
         (SEEN, SEEN.replace("\n", " * [1, 1, 1000]\n", 1), "; both are of one camera, in one order and unit"),
         ("setup.robot()", "setup.nominal.nominal, setup.start", "; the plant has to be the robot and camera that"),
