@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, Self, TypeAlias
 
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import reason, user_path
 from servobench.plant.contract.settings import suggest
 
@@ -47,7 +47,7 @@ class SourceFile:
             ConfigurationError: it cannot be read; names the nearest file beside it.
         """
         try:
-            path = user_path(given).resolve()
+            path = (present_folder() / user_path(given)).resolve()
             return cls(path, path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
             beside = [each.name for each in path.parent.glob("*.py")] if path.parent.is_dir() else []
@@ -78,7 +78,7 @@ class SourceFile:
         module.__file__, module.__package__ = str(self.path), ""
         sys.modules[name] = module
         try:
-            with contextlib.chdir(Path.cwd()):  # the folder is the same after the import
+            with contextlib.chdir(present_folder()):  # the folder is the same after the import
                 exec(compile(self.text, str(self.path), "exec"), vars(module))
         except BaseException as error:
             del sys.modules[name]
@@ -114,6 +114,12 @@ def _origin(name: str) -> Path | None:
     if spec is None or not spec.origin:
         return None
     return Path(spec.origin).resolve() if spec.has_location else Path(f"the built-in {name}")
+
+
+@configuration_errors("the present folder was deleted; change to one that exists: ", FileNotFoundError)
+def present_folder() -> Path:
+    """Return the present folder; a `ConfigurationError` says that it was deleted."""
+    return Path.cwd()
 
 
 def make_importable(folder: Path) -> None:
@@ -175,7 +181,7 @@ def _libraries() -> tuple[str, ...]:
 
 def show(path: Path) -> str:
     """Return a path as a user reads it best: relative to the present folder where it lies below it."""
-    here = Path.cwd()
+    here = present_folder()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
@@ -184,7 +190,7 @@ def is_place(text: str) -> bool:
     found = PLACE.fullmatch(text)
     if found is None or found["file"] is not None:
         return found is not None
-    make_importable(Path.cwd())
+    make_importable(present_folder())
     try:
         return importlib.util.find_spec(found["module"].partition(".")[0]) is not None
     except (ImportError, ValueError):
@@ -202,10 +208,10 @@ def import_user_module(module: str) -> ModuleType:
     Raises:
         ConfigurationError: it cannot be imported; one line with the place in it.
     """
-    make_importable(Path.cwd())
+    make_importable(present_folder())
     count_as_users(module)
     try:
-        with contextlib.chdir(Path.cwd()):
+        with contextlib.chdir(present_folder()):
             return importlib.import_module(module)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(describe_at(error)) from error

@@ -206,6 +206,14 @@ def test_a_place_without_a_controller_is_refused_with_the_nearest_one(tmp_path, 
         choose_controller(place)
 
 
+def test_a_present_folder_that_was_deleted_is_named(tmp_path, monkeypatch):
+    (folder := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    with pytest.raises(ConfigurationError, match="the present folder was deleted; change to one that exists"):
+        choose_controller("./mine.py")
+
+
 def test_two_files_beside_two_controllers_that_have_one_name_are_refused(tmp_path):
     for folder in "ab":
         write(tmp_path, f"GAIN = {folder!r}\n", f"{folder}/own_helper_of_a_user.py")
