@@ -262,10 +262,6 @@ def _rounded(x: Expression) -> Expression:
     return nearest - tie
 
 
-def _remainder(x: Expression, y: Expression) -> Expression:
-    return x - y * casadi.floor(x / y)
-
-
 ARITHMETIC: Mapping[str, Operation] = {
     "add": lambda x, y: x + y, "subtract": lambda x, y: x - y, "multiply": lambda x, y: x * y,
     "divide": lambda x, y: x / y, "power": lambda x, y: x**y, "negative": lambda x: -x, "positive": lambda x: x,
@@ -274,7 +270,7 @@ ARITHMETIC: Mapping[str, Operation] = {
     "tan": casadi.tan, "arcsin": casadi.asin, "arccos": casadi.acos, "arctan": casadi.atan, "arctan2": casadi.atan2,
     "sinh": casadi.sinh, "cosh": casadi.cosh, "tanh": casadi.tanh, "hypot": casadi.hypot, "sign": casadi.sign,
     "copysign": casadi.copysign, "floor": casadi.floor, "ceil": casadi.ceil, "rint": _rounded,
-    "maximum": casadi.fmax, "minimum": casadi.fmin, "remainder": _remainder,
+    "maximum": casadi.fmax, "minimum": casadi.fmin, "remainder": lambda x, y: x - y * casadi.floor(x / y),
     "floor_divide": lambda x, y: casadi.floor(x / y), "reciprocal": lambda x: 1.0 / x,
 }  # fmt: skip
 COMPARISONS: Mapping[str, Operation] = {

@@ -144,6 +144,12 @@ def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     return product
 
 
+def _cross(a: Any, b: Any, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
+    one, other = (as_traced(np.moveaxis(each, axis, -1)) for each in (a, b))
+    product = one[..., [1, 2, 0]] * other[..., [2, 0, 1]] - one[..., [2, 0, 1]] * other[..., [1, 2, 0]]
+    return as_traced(np.moveaxis(product, -1, axis))
+
+
 def _einsum(subscripts: str, a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
     if subscripts != "...i,...j->...ij":
         raise NotTraceable(f'it calls numpy.einsum("{subscripts}"), of which only products a bᵀ have an exported form')
@@ -319,7 +325,7 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
     np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
     np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum,
-    np.clip: _clip, np.dot: _dot, np.einsum: _einsum,
+    np.clip: _clip, np.dot: _dot, np.cross: _cross, np.einsum: _einsum,
     np.trace: lambda array, *axes, **named: reduced("add", np.diagonal(array, *axes, **named), axis=-1),
     np.count_nonzero: lambda array, axis=None: reduced("add", elementwise("not_equal", array, 0.0), axis),
     np.copy: lambda array: as_traced(array).copy(),

@@ -251,7 +251,8 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
      "controller 'rbf_pid' cannot be exported while it probes its initial Jacobian: set initial.source to nominal"),
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "controller 'ukf_mpc' has no exported form: it "
      "holds something that is no formula"),
-    (("fmu", "export", "--controller", "mfac+rls", "--sensing", "plate", "-o", "new.fmu"), "plate, but perhaps with"),
+    (("fmu", "export", "--controller", "mfac+rls", "--sensing", "./untraced.py", "-o", "new.fmu"),
+     "untraced.py, but perhaps with another: "),
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
     (("fmu", "export", "--controller", "ukf_mfak", "-o", "new.fmu"), "did you mean 'ukf_mfac'?"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
@@ -326,6 +327,7 @@ SETUPS = (  # file, its second feature, the name of its third, unit
     ("mm.py", "np.arctan(y / (x + 1.0))", "depth", "mm"),
     ("thousands.py", "1000.0 * y", "depth", "m"),
     ("named_twice.py", "y", "arc", "m"),
+    ("untraced.py", "np.interp(y, [-9.0, 9.0], [-9.0, 9.0])", "depth", "m"),
 )
 UNLIKELY = (  # task, its settings, sensing, message
     ("circle", {"lap_time": 0.5}, "position", "the reference of the task circle moves at 3.7"),
