@@ -60,9 +60,11 @@ def in_unit(number: float, unit: str, own: str) -> float:
 def alternatives(number: float, own: str) -> list[tuple[str, float]]:
     """Return the quantities that a plain number may have been meant as, with their values in the own unit.
 
-    They are those in smaller units and rates: a number that is too large in metres may be one of millimetres.
+    They are those in smaller units and rates: a number that is too large in metres may be one of millimetres, or below
+    100 of centimetres.
     """
-    smaller = [unit for unit, per in UNITS.get(own, {}).items() if per > 1.0 and unit not in ("us", "cm")]
+    unlikely = ("us",) if abs(number) < 100.0 else ("us", "cm")
+    smaller = [unit for unit, per in UNITS.get(own, {}).items() if per > 1.0 and unit not in unlikely]
     rates = [rate for rate, unit in RATES.items() if unit == own]
     if abs(number) < 1.0 or (own == "1" and number < 0.0):  # a share
         return []

@@ -202,7 +202,11 @@ def test_an_unlikely_file_is_remarked_on(write, caplog):
         ),
         (QUARTER, "[1.0, 0.0, 0.0, 0.0]", "by more than 60° from the flange's z axis: z is"),
         (QUARTER, "[0.5, -0.5, 0.5, -0.5]", "a quaternion is x, y, z, w"),
-        ("[pose]", "target.radius = 40\n[pose]", "target.radius is 40, and usually at most 0.5 m; if 40mm is meant"),
+        (
+            "[pose]",
+            "target.radius = 40\n[pose]",
+            "target.radius is 40, and usually at most 0.5 m; if 40cm or 40mm is meant",
+        ),
         (ON_FLANGE, ABOVE.replace("1.9]", "15.5]"), "pose.position is 15.5, and usually at most 5 m"),
     ]
     own.assert_remarks(caplog, lambda text: read_camera(write(text)), CAMERA + ON_FLANGE, cases)

@@ -279,6 +279,8 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
             ": joint 'joint_4': origin.0 .* 350.0; if 350mm is meant, write 0.35, as",
         ),
         (HEAVY.replace("0 0 0.3", "0 0 300"), ": joint 'joint_1': origin.2 .* 300.0; if 300mm is meant, write 0.3, as"),
+        (HEAVY.replace("0 0 0.3", "0 0 30"), ".* got 30.0; if 30cm or 30mm is meant, write 0.3 or 0.03, as units"),
+        (HEAVY.replace("0 0 0.3", "0 0 -1.2"), r": the arm has no posture .* at \(0, 0, -1.2\) m; .* at \(0, 0, 0\)"),
         (
             HEAVY.replace("0 0 0.3", "0 3 0.3"),
             r": the arm has no posture .* at \(0, 3, 0.3\) m; .* an arm at \(0, 0, 0\)",
