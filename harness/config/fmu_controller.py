@@ -105,6 +105,8 @@ class FmuController(Controller):
                 raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
         given = {role: found[role] for role in ("joints", "features", "seen", "reference")}
         check_roles({"outputs": found["outputs"], "jacobian": found["jacobian"], **given}, given, self._description)
+        values = self._description.select(mapping.parameters, "parameters", None)
+        check_roles({**given, "parameters": values}, (), self._description)
         units = {"outputs": "rad/s", "joints": "rad", "features": feature_unit, "reference": feature_unit}
         for role, unit in units.items():
             check_unit(role, found[role], unit, any_quantity=role in ("features", "reference"))

@@ -17,10 +17,13 @@ from textwrap import shorten
 from typing import Any, Final, Self
 
 from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
 MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
+BASES: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # whose exponents define a unit
+SI_UNITS: Final = {(0, 1, 0, 0, 0, 0, 0, 0): "m", (0,) * 7 + (1,): "rad", (0, 0, -1, 0, 0, 0, 0, 1): "rad/s"}
 # A file name without folders; the standard wants an identifier of C.
 IDENTIFIER: Final = re.compile(r"(?!\.)[\w.+ -]{1,200}")
 
@@ -36,7 +39,7 @@ class Variable:
     type: str = "Real"  # such as Real, Float32, Int64, Boolean or String
     # sizes of its axes: numbers, or names of structural parameters with their start values
     dimensions: tuple[tuple[str, int], ...] = ()
-    unit: str = ""  # empty where none is told
+    unit: str = ""  # empty where none is told; see `_unit`
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
@@ -145,6 +148,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
             f"fmu file {path} has the modelIdentifier {_line(repr(identifier))}, which is no name of a library: "
             "wanted letters, digits and '_', without folders"
         )
+    units = {each.name: _unit(each) for each in description.unitDefinitions}
     return FmuDescription(
         path=path,
         root=root,
@@ -155,7 +159,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
         once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
-        variables=tuple(_variable(each, path) for each in description.modelVariables),
+        variables=tuple(_variable(each, path, units) for each in description.modelVariables),
         needs_tool=bool(interface.needsExecutionTool),
         exchange=description.coSimulation is None,
         n_states=int(description.numberOfContinuousStates or 0),
@@ -220,7 +224,18 @@ def _line(words: object) -> str:
     return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
 
 
-def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's variables carry no usable types
+def _unit(unit: Any) -> str:  # noqa: ANN401 - as above
+    """Return the usual name of a unit of length, angle or speed, or such as `0.1 × rad`; else its own name."""
+    base, name = unit.baseUnit, str(unit.name)
+    own = None if base is None else SI_UNITS.get(tuple(getattr(base, each) for each in BASES))
+    if own is None or (base.factor, base.offset) == (1.0, 0.0):
+        return name
+    usual = [each for each, per in UNITS[own].items() if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)]
+    shift = f"{base.offset:g} + " if base.offset else ""
+    return f"{shift}{base.factor:g} × {own}" if shift or not usual else usual[0]
+
+
+def _variable(variable: Any, path: Path, units: Mapping[str, str]) -> Variable:  # noqa: ANN401 - as above
     name, reference = variable.name, variable.valueReference
     if name is None or not 0 <= reference < 2**32:
         raise ValueError(
@@ -232,7 +247,7 @@ def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's v
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
     unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
-    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, unit)
+    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, units.get(unit, unit))
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above

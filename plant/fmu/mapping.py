@@ -184,6 +184,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     found = {role: description.select(names, role) for role, names, *_ in roles}
     again = ("truth.features", "truth.states")
     check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
+    values = description.select(mapping.parameters, "parameters", None)
+    check_roles({"inputs": found["inputs"], "parameters": values}, (), description)
     declared = {variable.unit.translate(SPELLINGS): variable.name for variable in found["features"]}
     if (known := DECLARED & declared.keys()) and unit.translate(SPELLINGS) not in known:
         raise ValueError(f"names.feature_unit must be {min(known)}, the unit of {declared[min(known)]}, got {unit}")
@@ -229,8 +231,8 @@ def check_unit(role: str, variables: Iterable[Variable], own: str, *, any_quanti
     """
     for variable in variables:
         unit, wanted = variable.unit.translate(SPELLINGS), own.translate(SPELLINGS)
-        same = unit in UNITS.get(wanted, {})  # quantity
-        if unit in DECLARED and unit != wanted and (same or not any_quantity):
+        same = unit in UNITS.get(wanted, {}) or unit.endswith(f" × {wanted}")  # quantity
+        if (unit in DECLARED or " × " in unit) and unit != wanted and (same or not any_quantity):
             remedy = "convert it in the FMU" if same else "name another variable"
             raise ValueError(f"{role} names {variable.name!r}, whose unit is {unit}; wanted {own}: {remedy}")
 

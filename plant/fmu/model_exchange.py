@@ -85,7 +85,7 @@ def build_model(
         raise ValueError("truth.states must name the states of the FMU that are the joint positions, got none")
     values: dict[str, float] = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
-        variables = description.find(name, "parameters", None)
+        variables = description.find(name, "nominal" if parameters and name in parameters else "parameters", None)
         if variables[0].type == "String":
             raise ValueError(f"parameter {name!r} is a text, which CasADi cannot give to the FMU's model")
         if np.shape(value) not in ((), (len(variables),)):
@@ -104,7 +104,7 @@ def _feature_function(
     try:
         builder = casadi.DaeBuilder("fmu", str(root))
         states, constants, fixed = list(builder.x()), list(builder.p()), list(builder.c())
-        _check_names("parameters", parameters, [*constants, *fixed], f"parameters of {path.name}")
+        _check_names("parameters or nominal", parameters, [*constants, *fixed], f"parameters of {path.name}")
         _check_names("joints", joints, states, f"states of {path.name}")
         _check_names("features", features, list(builder.y()), f"outputs of {path.name}")
         for name in set(fixed).intersection(parameters):

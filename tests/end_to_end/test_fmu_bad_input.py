@@ -12,6 +12,8 @@ from kit.foreign_fmu import build_crane, describe_with, mapping
 FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
 TYPES = '<TypeDefinitions><SimpleType name="Rate"><Real unit="deg/s"/></SimpleType></TypeDefinitions><ModelVariables>'
 IN_DEGREES = describe_with(2, "<ModelVariables>", TYPES).replace('<Real start="0.0"/>', '<Real declaredType="Rate"/>')
+SPEED = '<UnitDefinitions><Unit name="speed"><BaseUnit s="-1" rad="1" factor="{}"/></Unit></UnitDefinitions><TypeD'
+SCALED = IN_DEGREES.replace('"deg/s"', '"speed"').replace("<TypeD", SPEED)
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
 
 
@@ -90,6 +92,9 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, mo
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
         (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
         (2, {"description": IN_DEGREES}, "", "inputs names 'push.slew', whose unit is deg/s; wanted rad/s"),
+        (2, {"description": SCALED.format("0.0174533")}, "", "'push.slew', whose unit is deg/s; wanted rad/s: convert"),
+        (2, {"description": SCALED.format("0.1")}, "", "'push.slew', whose unit is 0.1 × rad/s; wanted rad/s: convert"),
+        (2, {}, "[parameters]\n'push.slew' = 2\n", "parameters names 'push.slew' as inputs does; each has its own"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
         (3, {"description": describe_with(3, 'start="2"', 'start="3"')}, "",
          "reading wheel[1], wheel[2], wheel[3], … returned"),

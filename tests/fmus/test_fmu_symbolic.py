@@ -192,7 +192,7 @@ def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, ol
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MAPPING + NOMINAL.replace("arm.luff", "arm.lufff"), "parameters names 'arm.lufff', .*did you mean 'arm.luff'"),
+        (MAPPING + NOMINAL.replace("arm.luff", "arm.lufff"), "nominal names 'arm.lufff', .*did you mean 'arm.luff'"),
         (MAPPING + NOMINAL.replace("0.4", "[0.4, 0.4]"), "parameter 'arm.luff' must have 1 values, got 2"),
         (MAPPING + STATES.replace("wheel.luff", "place.luff"), "'place.luff', which is none of the states of crane"),
         (MAPPING + STATES.replace(', "wheel.luff"', ""), "truth.states must name 2 numbers"),

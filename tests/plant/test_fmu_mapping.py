@@ -127,7 +127,7 @@ def test_a_unit_of_features_that_is_not_the_fmu_s_is_refused(tmp_path, told, giv
     ],
 )
 def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, message):
-    spec_of(tmp_path, home="q0", camera=("at", "turned"))
+    spec_of(tmp_path, {"v": "1/s", "q": "1"}, home="q0", camera=("at", "turned"))
     with pytest.raises(ValueError, match=message):
         spec_of(tmp_path, {role: unit}, home="q0", camera=("at", "turned"))
 
