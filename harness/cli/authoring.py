@@ -266,8 +266,10 @@ def serve(
     request = RunRequest(*names, read_mismatch(mismatch), seed, robot=robot, sensing=sensing)
 
     with careful():
-        with configuration_errors(f"plant {plant}: ", RunFault):
+        try:
             served = server.Server(request, overrides.settings(), say, lockstep=lockstep)
+        except RunFault as fault:
+            raise ConfigurationError(f"plant {plant}: {fault}") from fault
         try:
             asyncio.run(served.serve(address))
         finally:

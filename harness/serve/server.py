@@ -6,6 +6,7 @@ keeps an arm safe: it stands in for a robot that has its own limits.
 
 import asyncio
 import base64
+import errno
 import ipaddress
 import json
 import os
@@ -115,15 +116,17 @@ class Server:
                 try:
                     server = await asyncio.start_server(guarded, address, port, limit=LINE_SIZE)
                 except OSError as error:
-                    raise ConfigurationError(
-                        f"{name} port {port} of {address} cannot be opened: {os.strerror(error.errno or 0)}; "
-                        "end what uses it, or serve at another address, such as --address 127.0.0.2"
-                    ) from error
+                    remedy = "serve at another address of this machine, such as --address 127.0.0.2"
+                    if error.errno == errno.EADDRINUSE:
+                        remedy = f"end what uses it, or {remedy}"
+                    failed = f"{name} port {port} of {address} cannot be opened: {os.strerror(error.errno or 0)}"
+                    raise ConfigurationError(f"{failed}; {remedy}") from error
                 stack.callback(server.close)
             if not ipaddress.ip_address(address).is_loopback:
                 self._say(f"warning: whoever reaches {address} can move this plant; there is no password")
             ports = ", ".join(f"{name} {port}" for name, port in PORTS.items())
-            self._say(f"serving {'in lockstep' if self._lockstep else 'in real time'} at {address}: {ports}")
+            clocked = "lockstep" if self._lockstep else f"real time, in steps of {1e3 * self._spec.period:g} ms,"
+            self._say(f"serving in {clocked} at {address}: {ports}")
             self._say("conformance with ur-rtde 1.6.5 is checked, safety is not; Ctrl-C ends it")
             clock = asyncio.get_running_loop().time
             due = clock()

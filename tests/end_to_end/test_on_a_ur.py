@@ -116,6 +116,7 @@ def test_a_server_that_dies_or_hangs_ends_the_run_with_a_reason(tmp_path, stop):
 @pytest.mark.slow
 def test_a_client_that_is_killed_leaves_an_arm_that_stands(tmp_path):
     with served(settings={"target": {"duration": 60.0}}, lockstep=False) as (_, address, lines):
+        assert "serving in real time, in steps of 2 ms, at" in lines[0]
         run = on_a_ur(address, tmp_path / "killed", "--set", "UR.patience=6.0", "--set", "target.duration=60.0")
         assert waited_for(lambda: "control program of" in lines[-1], 60.0)
         time.sleep(1.0)

@@ -298,9 +298,10 @@ def test_features_come_as_lines_of_json(lockstep):
     assert (frame["names"], frame["unit"], frame["valid"]) == (["x", "y", "z"], "m", [True] * 3)
 
 
-def test_a_port_that_is_taken_is_named_with_a_remedy(lockstep):
-    with pytest.raises(ConfigurationError, match=f"RTDE port 30004 of {lockstep[1]} cannot be opened: .* --address"):
-        asyncio.run(Server(REQUEST, Settings({}), print).serve(lockstep[1]))
+def test_a_port_that_cannot_be_opened_is_named_with_a_remedy(lockstep):
+    for address, remedy in ((lockstep[1], "end what uses it, or serve at"), ("192.0.2.1", "serve at")):
+        with pytest.raises(ConfigurationError, match=f"30004 of {address} cannot be opened: [^;]*; {remedy} another"):
+            asyncio.run(Server(REQUEST, Settings({}), print).serve(address))
 
 
 def test_outputs_of_the_control_box_are_set(lockstep):
