@@ -5,7 +5,8 @@ A challenge is a part of the results folder. On each robot the better of its ref
     score = min(1, max(reference, floor) / max(own, floor)),   0 for a lost run
 
 A run is lost if it does not settle, on a curve if it is not followed. A challenge whose references both lose more than
-`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
+`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking. Nor has a reference of
+some of the challenges only.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -95,10 +96,12 @@ def judge(challenge: Challenge, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def bounded(judged: pd.DataFrame) -> pd.DataFrame:
-    """Return the judged runs with a score whose references lose few enough robots to bound them."""
+    """Return the scored runs of challenges whose references lose few robots, of methods that were in all of them."""
     known = judged[judged["score"].notna()]
     lost = known.groupby(["challenge", "plant"])["reference"].transform(lambda own: own.isna().mean())
-    return known[lost <= MAX_REFERENCE_LOSS]
+    kept = known[lost <= MAX_REFERENCE_LOSS]
+    count = kept.groupby(["plant", "controller"])["seed"].transform("size")
+    return kept[count == count.groupby(kept["plant"]).transform("max")]  # a reference may be in some of them only
 
 
 def methods_rows(judged: pd.DataFrame) -> list[Row]:

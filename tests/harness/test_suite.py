@@ -171,6 +171,17 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
     assert {row["controller"].value for row in ranking_rows(judged)} == set(lost)
 
 
+def test_a_reference_of_some_challenges_only_has_no_rank():
+    own = {"mine": [1.0] * 3, "calibrated": [1.0] * 3}
+    tables = [
+        table_of(values, "settling_time_s", "point_to_point", 0.005) for values in (own, own | {"more": [1.0] * 2})
+    ]
+    first, second = challenge("settling"), Challenge("other", reference=("calibrated", "more"))
+    judged = pd.concat([judge(first, tables[0]), judge(second, tables[1])], ignore_index=True)
+    assert [row["controller"].value for row in ranking_rows(judged)] == ["mine", "calibrated"]
+    assert len(methods_rows(judged)) == 5
+
+
 @pytest.mark.slow
 def test_the_command_scores_methods_in_a_world_of_ones_own_and_goes_on_where_it_stopped(
     refusal_of, output_of, monkeypatch, tmp_path
