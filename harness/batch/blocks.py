@@ -16,6 +16,7 @@ import math
 import pickle
 import re
 import sys
+import threading
 import zlib
 from base64 import b64decode, b64encode
 from collections import deque
@@ -389,6 +390,7 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
+ONE_TASK: Final = threading.Lock()  # held by the one task that a process of an executor carries out at a time
 
 
 def can_travel(own: Sequence[Offer]) -> bool:
@@ -487,7 +489,8 @@ def _workers_of(executor: Executor, count: int, lost: tuple[type[BaseException],
 
 
 def _gather(task: Task) -> bytes:
-    """Carry a task out elsewhere; its answers travel as one compressed block."""
+    """Carry a task out elsewhere; its answers travel as one compressed block. Threads of a process take turns."""
     items: list[object] = []
-    task.carry_out(lambda item: None if item is None else items.append(item))
+    with ONE_TASK:
+        task.carry_out(lambda item: None if item is None else items.append(item))
     return zlib.compress(json.dumps(items).encode(), 1)

@@ -5,6 +5,8 @@ import itertools
 import json
 import math
 import pickle
+import time
+import zlib
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 
@@ -19,7 +21,7 @@ from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, e
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.sandbox import Answer, End, Workers
+from servobench.harness.batch.sandbox import Answer, End, Task, Workers
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import identity
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -76,6 +78,19 @@ def test_an_executor_of_threads_or_with_limits_of_runs_is_refused(tmp_path):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, threads))
     with pytest.raises(ConfigurationError, match="works with processes of this machine only"):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Here(), Bounds(5.0)))
+
+
+def _say_twice(_argument, tell):
+    tell(time.monotonic())
+    time.sleep(0.05)
+    tell(time.monotonic())
+
+
+def test_threads_of_a_worker_of_an_executor_take_turns():
+    task = Task(_say_twice, pickle.dumps(None))
+    with ThreadPoolExecutor(3) as threads:
+        spans = sorted(json.loads(zlib.decompress(each)) for each in threads.map(blocks._gather, [task] * 3))
+    assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(spans))
 
 
 @pytest.mark.parametrize(("block", "workers"), [(7, 1), (1000, 1), (1000, 2)])
