@@ -148,6 +148,8 @@ def compare(
     for name, switch in {"isolate": isolate, "resume": resume}.items():
         _require(isinstance(switch, int | np.bool_ | None), name, "True or False", switch)
     _require(isinstance(out, str | os.PathLike | None), "out", "the path of a folder", out)
+    if executor is not None and isolate:
+        remark("isolate has no effect with an executor: nothing limits the runs in its processes")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
