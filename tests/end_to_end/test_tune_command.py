@@ -63,6 +63,17 @@ def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(refu
     assert "rls.jsonl was made with other robots; name another folder with --out" in line
 
 
+@pytest.mark.slow
+def test_a_plant_of_the_user_is_tuned_on_and_another_version_of_it_refused(output_of, refusal_of, tmp_path):
+    output_of("new", "plant", "cell", "--folder", tmp_path)
+    words = ("tune", *SHORT, "--trials", "1", "--plants", tmp_path / "cell.py", "--out", tmp_path / "out")
+    output_of(*words)
+    assert read_tuned(tmp_path / "out" / "rls.toml").score < objective.WORST
+    with (tmp_path / "cell.py").open("a") as file:
+        file.write("# another version")
+    assert "rls.jsonl was made with other plants" in refusal_of(*words)
+
+
 def test_ctrl_c_keeps_the_study(tmp_path):
     out = tmp_path / "out"
     arguments = ("tune", "--controllers", "constant", "--robots", "2", "--workers", "2", "--trials", "500")

@@ -35,7 +35,7 @@ from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.config.registry import find_plant
+from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.lanes import side_by_side_key
@@ -219,7 +219,8 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Worke
             kinds.setdefault(side_by_side_key(run), []).append((t, r, run))
     order = [(kind, *each) for kind, same in kinds.items() for each in same]
     jobs = [Job(index, Cell(run.request), run, kind) for index, (kind, _, _, run) in enumerate(order)]
-    for block, outcome in carry_out_blocks(cut(jobs, even_size(len(jobs), workers.count), chunk=1), workers):
+    own = offered(dict.fromkeys(run.plant for run in runs))
+    for block, outcome in carry_out_blocks(cut(jobs, even_size(len(jobs), workers.count), 1, own), workers):
         for job, result in zip(block.jobs, outcome, strict=True):
             _, t, r, _ = order[job.index]
             yield t, r, run_cost(runs[r].task, result.row)
@@ -307,7 +308,7 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
         "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
         "objective": {name: repr(value) for name, value in constants.items()},
         "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
-        "plants": list(runs.plants),
+        "plants": [*runs.plants, *(each.digest for each in offered(runs.plants))],
         "robots": [runs.robots, runs.offset],
     }
     return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
