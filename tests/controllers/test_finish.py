@@ -82,6 +82,15 @@ def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
     np.testing.assert_allclose(held[:2], [1.0, 0.0], atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("excess", "room", "taken"), [(5e-6, 1.0, 5e-6), (5e-7, 1.0, 0.0), (0.5, 3e-9, 3e-9), (0.5, 3e-10, 0.0)]
+)
+def test_only_a_remainder_and_a_room_above_rounding_are_taken_over(excess, room, taken):
+    room, wanted, one = np.array([0.0, room]), np.array([1.0 + excess, 0.0]), np.ones(2)
+    dq = redistribute(wanted, np.ones((1, 2)), one, 1e-9, (np.zeros(2), room))
+    np.testing.assert_allclose(dq, [1.0, taken], rtol=1e-4, atol=1e-14)
+
+
 @settings(max_examples=60)
 @given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):

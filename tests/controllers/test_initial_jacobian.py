@@ -153,3 +153,7 @@ def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_tak
 def test_a_source_that_does_not_fit_the_robot_is_refused(settings, reach, message):
     with pytest.raises(ValueError, match=message):
         initial_jacobian(InitialConfig(**settings), RobotKnowledge(spec(reach), 0))
+
+
+def test_a_probing_move_of_half_the_joint_range_is_taken():
+    assert initial_jacobian(InitialConfig(source="probe", probe_step=0.03), RobotKnowledge(spec(0.03), 0))

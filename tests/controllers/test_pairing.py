@@ -163,6 +163,16 @@ def test_false_frames_count_as_lost_once_the_next_true_one_is_seen(false):
         np.testing.assert_allclose(now.scores, wanted.scores, rtol=1e-9)
 
 
+def test_the_fifth_false_frame_in_a_row_is_believed():
+    q = path(1.6)
+    y, doubted = late_features(q, np.eye(M), 0) + np.where(np.arange(len(q)) < 12, 0.0, 0.3)[:, None], []
+    made = Following(noise="given", feature_noise=5e-4).follow(q[:12], y[:12])
+    for k in range(12, 17):
+        made.see(q[k], y[k])
+        doubted.append(bool(made.pair.anchor.miss > 0.0))
+    assert doubted == [True] * 4 + [False]
+
+
 def test_a_frame_that_another_delay_explains_is_not_taken_for_a_false_one():
     q = path(1.6)
     y = late_features(q, np.eye(M), 0)
