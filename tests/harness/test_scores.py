@@ -77,6 +77,15 @@ def test_a_small_difference_on_every_robot_is_told_apart_as_robots_are_shared():
     assert ranked[0].score.low < ranked[1].score.value  # their intervals overlap
 
 
+@pytest.mark.parametrize(("seed", "ranks"), [(38, [1, 2]), (18, [1, 1])])
+def test_methods_are_told_apart_at_five_percent_of_both_sides(seed, ranks):
+    """The p-values are 0.036 and 0.081."""
+    generator = np.random.default_rng(seed)
+    robots = generator.uniform(0.3, 0.7, 20)
+    other = robots + 0.02 + generator.normal(0.0, 0.045, 20)
+    assert [each.rank for each in ranking(tidy("score", {"a": {"x": other}, "b": {"x": robots}}))] == ranks
+
+
 def test_equal_methods_share_a_rank_without_a_deviation():
     for other, ranks in ((0.5, [1, 1]), (0.4, [1, 2])):
         found = ranking(tidy("score", {"a": {"x": [0.5] * 4}, "b": {"x": [other] * 4}}))
