@@ -23,7 +23,7 @@ import numpy as np
 from servobench.harness.config.registry import find_plant
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
-from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
@@ -207,15 +207,11 @@ class SweepPlan:
             name, _, values = (part.strip() for part in text.partition("="))
             if name in settings:
                 raise ConfigurationError(f"--vary gives {name} twice; give all values in one place")
-            try:
+            with configuration_errors("--vary: "):
                 if name in SHORT_NAMES or "." in name:
                     settings[name] = parse_values(name, values)
                 else:
                     axes.append((name, parse_magnitudes(name, values)))
-            except ConfigurationError:
-                raise
-            except ValueError as error:
-                raise ConfigurationError(f"--vary: {error}") from error
         in_order = sorted(settings.items(), key=lambda pair: [*SHORT_NAMES, pair[0]].index(pair[0]))
         return cls(batch, tuple(axes), tuple(in_order))
 
@@ -271,8 +267,7 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
     Whole numbers become floats where others are floats, so that a column has one type.
 
     Raises:
-        ConfigurationError: there is no value, or one stands there twice.
-        ValueError: the range is malformed or empty.
+        ValueError: there is no value, one stands there twice, or the range is malformed or empty.
     """
     values: Sequence[Any]
     span = re.fullmatch(r"([-+0-9.e]+(?::[-+0-9.e]+){2})\s*([a-zA-Zµ°%/²]*)", text)
@@ -291,11 +286,11 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
         values = [float(each) for each in values]
     found = _in_one_way(name, values)
     if not found or "" in found:
-        raise ConfigurationError(f"--vary {name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2")
+        raise ValueError(f"{name} needs values, such as run.period=0.02,0.05 or task.duration=2:8:2")
     sizes = [_size(each) for each in found]
     for k, each in enumerate(found):
         if sizes[k] in sizes[:k]:
-            raise ConfigurationError(f"--vary {name} names {each} twice")
+            raise ValueError(f"{name} names {each} twice")
     return found
 
 
@@ -305,7 +300,7 @@ def _in_one_way(name: str, values: Sequence[Any]) -> tuple[Value, ...]:
     unit = next((parts[1] for parts in map(split_quantity, texts) if parts), "")
     found = tuple(f"0{unit}" if texts and unit and each == 0 else each for each in values)
     if texts and not all(isinstance(each, str) for each in found):
-        raise ConfigurationError(f"--vary {name} mixes numbers and texts; write the unit with all values, or with none")
+        raise ValueError(f"{name} mixes numbers and texts; write the unit with all values, or with none")
     return found
 
 
@@ -379,8 +374,7 @@ def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> No
         names = Counter(request.run_id for request in requests if hash(request.run_id) in suspects)
         name, count = names.most_common(1)[0]
         if count > 1:
-            remedy = "leave one out, or give one of two files another name in ASCII, NAME=FILE"
-            raise ConfigurationError(f"the run {name} is asked for twice: {remedy}")
+            raise ConfigurationError(f"the run {name} is asked for twice: leave one out, or name a file NAME=FILE")
 
 
 def _ranges(numbers: array[int]) -> list[range]:
