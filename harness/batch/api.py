@@ -5,7 +5,6 @@ import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, TypeAlias
@@ -161,7 +160,13 @@ def compare(
             if how.workers != 1 or how.scheduler or how.bounds != Bounds(isolate=False):
                 remark("code of this batch cannot be sent to other processes; its runs stay here, without limits")
             how = Execution(1, None, Bounds(isolate=False), resume)
-        return _rows(batch, Settings(settings or {}), out, how)
+        given = Settings(settings or {})
+        if out is not None:
+            carry_out(comparison(batch, given), Path(out), how)
+            return results.load_runs(Path(out))
+        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+            carry_out(Campaign(Grid(Cell, batch.requests()), given), Path(folder), how)
+            return results.load_runs(Path(folder))
 
 
 def _seeds(given: object) -> Sequence[int]:
@@ -186,16 +191,6 @@ def _check_lists(**given: object) -> None:
             raise ConfigurationError(f"{name} must be a list, such as [{values!r}], got {values!r}")
         if not len(values):
             raise ConfigurationError(f"{name} must name at least one, got none")
-
-
-def _rows(batch: Batch, settings: Settings, out: Path | str | None, how: Execution) -> pd.DataFrame:
-    """Carry a batch out and return its table of runs, which is kept in `out` if there is one."""
-    if out is not None:
-        carry_out(comparison(batch, settings), Path(out), how)
-        return results.load_runs(Path(out))
-    with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
-        carry_out(Campaign(Grid(Cell, batch.requests()), settings), Path(folder), replace(how, resume=False))
-        return results.load_runs(Path(folder))
 
 
 def load(folder: Path | str) -> Results:

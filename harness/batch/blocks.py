@@ -437,7 +437,9 @@ def open_workers(
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:
-                raise ConfigurationError(f"{option} works with processes of this machine only, not with --scheduler")
+                raise ConfigurationError(
+                    f"{option} works with processes of this machine only, no scheduler or executor"
+                )
         if isinstance(scheduler, Executor):
             yield _workers_of(scheduler, count)
             return

@@ -160,8 +160,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     from servobench.harness.batch.lock import current_holder
     from servobench.harness.batch.results import missing_line
 
-    holder = current_holder(folder)
-    if holder is not None:
+    if (holder := current_holder(folder)) is not None:
         say(f"{folder} is being written by {holder}")
     found = examine(folder)
     for finding in found.findings:

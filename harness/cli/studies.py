@@ -234,8 +234,7 @@ def tune(
         say(f"at most {_counted(plan)}; --controllers, --studies, --trials, --search and --robots make it less")
         methods = open_methods(out, plan)
         interrupted = not _advance(methods, plan, opened)
-    results = write_results(out, methods)
-    if results:
+    if results := write_results(out, methods):
         _print_tuned(results)
         say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:

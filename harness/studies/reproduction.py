@@ -77,14 +77,12 @@ def reproduce(
     return answers
 
 
-def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
-    """Draw a figure for each claim, a column a plant and division, a row a measurement; return all files."""
-    files = []
+def draw_answers(answers: Sequence[Answer], folder: Path) -> None:
+    """Draw a figure for each claim, a column a plant and division, a row a measurement."""
     for claim in dict.fromkeys(answer.claim for answer in answers):
         with figure_style():
             figure = _draw([answer for answer in answers if answer.claim == claim])
-        files += save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
-    return files
+        save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
 
 
 def _draw(answers: Sequence[Answer]) -> Figure:

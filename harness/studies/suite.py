@@ -5,8 +5,7 @@ A challenge is a part of the results folder. On each robot the better of its ref
     score = min(1, max(reference, floor) / max(own, floor)),   0 for a lost run
 
 A run is lost if it does not settle, on a curve if it is not followed. A challenge whose references both lose more than
-`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking. Nor has a reference of
-some of the challenges only.
+`MAX_REFERENCE_LOSS` of the robots bounds nothing: it has no grade and no part in the ranking.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -274,7 +274,7 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(output_of, m
     files = list((tmp_path / "first" / "figures").glob("*.png"))
     assert {file.stem for file in files} == {*(f"claim_{k}" for k in range(1, 8)), *reproduction.READINGS.values()}
     assert all(file.stat().st_size > 5_000 for file in files)
-    monkeypatch.setattr(reproduction, "draw_answers", lambda *_: [])
+    monkeypatch.setattr(reproduction, "draw_answers", lambda *_: None)
     wanted = tmp_path / "wanted.csv"
     wanted.write_text((tmp_path / "first" / "answers.csv").read_text())
     again = (*short, "--out", str(tmp_path / "first"), "--resume", "--check", str(wanted))

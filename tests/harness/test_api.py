@@ -32,6 +32,13 @@ def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process_and_a_l
         assert ("its runs stay here, without limits" in caplog.text) == (workers == 2)
 
 
+def test_isolation_with_an_executor_is_said_to_have_no_effect(caplog):
+    remark.cache_clear()
+    with pytest.raises(NotImplementedError):  # the abstract one takes no task
+        servobench.compare(["constant"], settings=SHORT, executor=Executor(), isolate=True)
+    assert "isolate has no effect with an executor" in caplog.text
+
+
 BELOW_THE_GUARD = """
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
@@ -107,7 +114,11 @@ RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, 
         (COMPARE, {"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
         (COMPARE, {"resume": True}, "resume needs out, the folder to continue in"),
         (servobench.load, {"folder": 3}, "folder must be the path of a folder, got 3"),
-        (COMPARE, {"executor": Executor(), "run_memory": 1e9}, "run_memory need processes of this machine: leave exec"),
+        (
+            COMPARE,
+            {"executor": Executor(), "run_memory": 1e9},
+            "--run-memory works with processes of this machine only",
+        ),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):
