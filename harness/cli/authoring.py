@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -200,8 +201,7 @@ def identify(
         say(f"{log}: {mistake}")
         sys.exit(FAILED)
     print_tables([(f"{log} against a {own.title}, where they differ", estimates(found, response))])
-    for line in remarks(rows, found, response):
-        say(line)
+    say("\n".join(remarks(rows, found, response)))
     if out is not None:
         with accessing(out):
             folder = out.resolve().parent  # where the twin looks for files first
@@ -211,7 +211,7 @@ def identify(
             )
             text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
-        say(f"twin in {out}; the next command: servobench compare --robot {out} --plants kinematic")
+        say(f"twin in {out}; the next command: servobench compare --robot {quote(str(out))} --plants kinematic")
 
 
 def _logged(
