@@ -437,9 +437,7 @@ def open_workers(
     if scheduler is not None:
         for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
             if value is not None:
-                raise ConfigurationError(
-                    f"{option} works with processes of this machine only, no scheduler or executor"
-                )
+                raise ConfigurationError(f"{option} works with processes of this machine only, not on a cluster")
         if isinstance(scheduler, Executor):
             yield _workers_of(scheduler, count)
             return

@@ -89,13 +89,15 @@ def robustness(
     from servobench.harness.batch import results
     from servobench.harness.batch.plan import Batch, parse_seeds
     from servobench.harness.cli.progress import watching
+    from servobench.harness.run.request import find_robot
     from servobench.harness.studies.robustness import BASE, TASK, find_lines, make_map
 
     settings = overrides.settings()
     lines = find_lines(selection.split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
-    batch = Batch((where,), names, (TASK,), (BASE,), parse_seeds(seeds), robot, (sensing,))
+    base = "none" if find_robot(robot).twin else BASE
+    batch = Batch((where,), names, (TASK,), (base,), parse_seeds(seeds), robot, (sensing,))
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")

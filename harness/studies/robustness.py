@@ -33,7 +33,7 @@ from servobench.harness.config.registry import RENDERED, find_controller, find_p
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures import style
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
-from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied
+from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, RunSettings, Varied, find_robot
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
@@ -118,7 +118,7 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
 
     Args:
         out: folder of the map.
-        batch: its runs at one place, of the task `TASK` with the mismatch `BASE`.
+        batch: its runs at one place, of the task `TASK` with the mismatch `BASE`, none on a twin.
         settings: overrides of the defaults.
         how: how the runs are carried out.
         lines: its axes.
@@ -134,9 +134,9 @@ def make_map(out: Path, batch: Batch, settings: Settings, how: Execution, lines:
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
     moving = () if "duration" in settings.sections.get(TASK, {}) else LONGER  # a duration that a user gives is kept
     carry_out(Campaign(map_cells(batch, lines, moving), settings), out, how)
-    limits: dict[str, float] = {}
-    if any(line.axis == LATENCY for line in lines) and batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED:
-        limits = predicted_limits(batch.controllers, settings, batch.robot, plant)
+    linear = batch.sensings == (DEFAULT_SENSING,) and plant not in RENDERED and find_robot(batch.robot).twin is None
+    drawn = linear and any(line.axis == LATENCY for line in lines)
+    limits = predicted_limits(batch.controllers, settings, batch.robot, plant) if drawn else {}
     column = pd.Series(limits, name="predicted_latency_limit_s")
     write_atomically(out / LIMITS, partial(column.to_csv, index_label="controller"))
     return draw_map(map_runs(out), out / FIGURES, limits)

@@ -114,16 +114,22 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, figures):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("plant", "predicted"), [("kinematic", ["constant"]), pytest.param("mujoco", [], marks=NEEDS_MUJOCO)]
-)
-def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_rendered_arms(
-    monkeypatch, tmp_path, plant, predicted
+    ("plant", "robot", "predicted"),
+    [("kinematic", "ur5", ["constant"]), ("kinematic", "twin.toml", []),
+     pytest.param("mujoco", "ur5", [], marks=NEEDS_MUJOCO)],
+)  # fmt: skip
+def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_twins_and_rendered_arms(
+    monkeypatch, tmp_path, plant, robot, predicted
 ):
+    pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]}"
+    (tmp_path / "twin.toml").write_text(f"robot = 'ur10e'\n[camera]\n{pose}\n")
+    monkeypatch.chdir(tmp_path)
     line = Line(LATENCY, "camera latency [ms]", (Magnitude(0.0, "ms"),))
     monkeypatch.setattr(robustness, "KNOWN_LINES", {LATENCY: line})
-    words = ("--axes", LATENCY, "--plant", plant, "--controllers", "constant", "--seeds", "1", "--workers", "1")
-    assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=0.2", "--out", str(tmp_path)) == 0
-    assert pd.read_csv(tmp_path / "predicted_limits.csv")["controller"].to_list() == predicted
+    words = ("--axes", LATENCY, "--plant", plant, "--robot", robot, "--controllers", "constant", "--seeds", "1",
+             "--workers", "1")  # fmt: skip
+    assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=0.2", "--out", "map") == 0
+    assert pd.read_csv("map/predicted_limits.csv")["controller"].to_list() == predicted
 
 
 def test_runs_of_a_map_that_failed_are_told(monkeypatch, tmp_path, capsys):
