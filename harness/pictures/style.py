@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from servobench.controllers.methods import PUBLISHED
+from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import write_atomically
@@ -169,7 +169,7 @@ def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
 
 
 def divisions(names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the names with aids and those as published, under a heading each; the upper bounds are in all.
+    """Return the names as published and the others, under a heading each; the upper bounds are in all.
 
     Without a method as published, or with no other, there is one division without a heading. A division of more than
     `MOST_LINES` methods is divided further.
@@ -180,7 +180,9 @@ def divisions(names: Iterable[str]) -> dict[str, list[str]]:
     others = [name for name in wanted if name not in published]
     if not published or len(others) == len(bounds):
         return _parts("", wanted, bounds)
-    return _parts("with aids", others, bounds) | _parts("as published", published + bounds, bounds)
+    aided = all(name in bounds or name + PUBLISHED in METHODS for name in others)
+    head = "with aids" if aided else "with aids, and others"
+    return _parts(head, others, bounds) | _parts("as published", published + bounds, bounds)
 
 
 def fitted(name: str, letters: int) -> str:
