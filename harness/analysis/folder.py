@@ -15,9 +15,9 @@ from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
 from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.settings import listed
 
 DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch")  # columns, with settings that are varied
-MAX_LISTED: Final = 15  # values of a column
 
 
 def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
@@ -31,7 +31,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
     described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(runs.columns)
     for name, (heading, factor) in described.items():
-        facts[heading] = _listed([shown_value(value, factor) for value in runs[name].unique()])
+        facts[heading] = listed([shown_value(value, factor) for value in runs[name].unique()])
     by = (manifest.get("packages") or {}).get("servobench") or "unknown"
     commit = f", commit {manifest['git_commit']}" if manifest.get("git_commit") else ""
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {by}{commit}"
@@ -73,17 +73,11 @@ def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
     return {"inf": "no limit", "None": "not set"}.get(str(value), str(value))
 
 
-def _listed(values: list[str]) -> str:
-    return ", ".join(values[:MAX_LISTED]) + (
-        f" and {len(values) - MAX_LISTED} more" if len(values) > MAX_LISTED else ""
-    )
-
-
 def _seeds(seeds: list[int]) -> str:
     unique = sorted(set(seeds))
     if len(unique) > 2 and unique[-1] - unique[0] == len(unique) - 1:
         return f"{unique[0]} to {unique[-1]} ({len(unique)})"
-    return _listed(list(map(str, unique)))
+    return listed(list(map(str, unique)))
 
 
 SIGNS: Final = str.maketrans(
@@ -147,24 +141,26 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     Raises:
         ConfigurationError: not a results folder.
     """
-    manifest, facts = results.read_manifest(folder), describe_folder(folder, runs)
+    manifest, facts, aids = results.read_manifest(folder), describe_folder(folder, runs), describe_controllers(folder)
     packages = manifest.get("packages") or {}
     version = str(packages.get("servobench") or "unknown").translate(SIGNS)
     commit = str(manifest.get("git_commit") or "unknown")[:12].translate(SIGNS)
     used = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
     used += [str(engine) for engine in (manifest.get("engines") or {}).values()]
     robots = ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
+    mismatch = facts["mismatch"].replace("none", "drawn from the twin" if robots.endswith(" twin") else "none")
     seeds, count = facts["seeds"].partition(" (")[0], runs["seed"].nunique()
     sentences = [
         f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, "
         + f"Python {manifest.get('python', 'unknown')}, {', '.join(used)})".translate(SIGNS),
         f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
-        f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {facts['mismatch']}",
+        f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {mismatch}",
+        *[f"Aids (stages around the law, which any controller can have): {aids}"] * bool(aids),
         *_varied(facts, runs),
         f"Every controller met the same {count} random robot{'s' * (count > 1)} (seeds {seeds}; {len(runs)} runs)",
         "Rates are given with Wilson intervals (95 %), medians with bootstrap intervals (95 %)",
         "Differences are paired by robot, with Student's intervals (90 %) of their means; verdicts are those of a sign "
-        "test on lost runs and of two one-sided t-tests (5 %) against the stated margin",
+        "test on lost runs, which ended early or have no value, and of two one-sided t-tests (5 %) against the margin",
         _settings(manifest.get("changed")),
     ]
     text = [sentences[0], *(each.translate(SIGNS) for each in sentences[1:])]

@@ -24,6 +24,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.settings import listed
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
@@ -126,9 +127,8 @@ def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
         ConfigurationError: names the first seed of the tuning range and says which to take instead.
     """
     if found := [seed for seed in seeds if seed in TUNING]:
-        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise ConfigurationError(
-            f"seed {found[0]}{more} cannot be used to judge: {TUNING_WORDS} are kept for tuning; "
+            f"seed {listed(list(map(str, found)), 1)} cannot be used to judge: {TUNING_WORDS} are kept for tuning; "
             f"take seeds below {TUNING.start} or from {TUNING.stop} on"
         )
 

@@ -159,6 +159,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
     from servobench.harness.batch.results import missing_line
+    from servobench.plant.contract.settings import listed
 
     if (holder := current_holder(folder)) is not None:
         say(f"{folder} is being written by {holder}")
@@ -167,8 +168,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(f"{folder / finding.name} {finding.fault}: {finding.remedy}")
     say(missing_line(found.runs, found.wanted))
     if found.left_out:
-        more = f" and {len(found.left_out) - MAX_FAULTS} more" if len(found.left_out) > MAX_FAULTS else ""
-        say(f"not checked, as SHA256SUMS does not list it: {', '.join(found.left_out[:MAX_FAULTS])}{more}")
+        say(f"not checked, as SHA256SUMS does not list it: {listed(found.left_out, MAX_FAULTS)}")
     if found.findings:
         sys.exit(FAILED)
     say(f"{found.files} files are as they were written, {found.runs} runs")

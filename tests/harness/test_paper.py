@@ -53,6 +53,7 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
     assert re.search(r"Python 3\.\d+\.\d+, numpy [\d.]+, scipy [\d.]+\)", text)
     assert "Controllers: constant, calibrated; tasks: exp2; plant: kinematic (UR5)" in text
     assert "the same 2 random robots (seeds 0, 1; 4 runs)" in text
+    assert "any controller can have): without aids: constant; with all aids but model: calibrated." in text
     assert "Varied" not in text
     assert "Settings other than the defaults: exp2.duration = 2." in text
     assert "@misc{servobench," in text
@@ -61,6 +62,22 @@ def test_the_paragraph_on_methods_has_versions_seeds_and_changed_settings_alone(
 def test_the_paragraph_on_methods_names_what_a_sweep_varies(tmp_path):
     folder = sweep(tmp_path / "sweep")
     assert ". Varied: latency [ms] 0, 50. " in methods_paragraph(folder, load_runs(folder))
+
+
+def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path):
+    twin, out = tmp_path / "twin.toml", tmp_path / "out"
+    pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [0, 0, 0, 1]}"
+    twin.write_text(f"robot = 'ur5'\n[camera]\n{pose}\n", encoding="utf-8")
+    compare(
+        ["constant"],
+        tasks=["exp2"],
+        robot=str(twin),
+        mismatches=["none"],
+        settings={"exp2": {"duration": 0.5}},
+        out=out,
+    )
+    text = methods_paragraph(out, load_runs(out))
+    assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
