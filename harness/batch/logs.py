@@ -66,9 +66,10 @@ def logged_in_folder(
         ConfigurationError: no such run, one without steps, one whose row names code that the user did not name, or one
             that cannot be made ready here.
     """
-    row = find_run(folder, run_id)
+    row, manifest = find_run(folder, run_id), results.read_manifest(folder)
+    own = {name: str(told.get("place")) for name, told in manifest.get("own_controllers", {}).items()}
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
-        if CODE.search(name := str(row.get(word, ""))) and name != sensing:
+        if CODE.search(name := own.get(row.get(word), str(row.get(word, "")))) and name != sensing:
             raise ConfigurationError(
                 f"{folder} names code that would be run, {word} {name}; "
                 + ("nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it")
@@ -76,7 +77,6 @@ def logged_in_folder(
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
-    manifest = results.read_manifest(folder)
     names = ("plant", "task", "mismatch", "robot", "sensing")
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
     if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
@@ -96,7 +96,8 @@ def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool)
     """
     told, changed, name = manifest.get("configuration", {}), manifest.get("changed") or {}, request.plant
     read = ["run", name, request.task, *([request.controller] if own else [])]
-    period = dict(request.varied).get("run.period", told.get("run", {}).get("period", RunSettings.period))
+    common = told.get("run", {}).get("period", RunSettings.period)
+    period = dict(request.varied).get("run.period", common)
     flat = {
         each: {
             RENAMED.get(key, key): period * value if key in RENAMED else value
@@ -104,7 +105,7 @@ def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool)
         }
         for each in read
     }
-    usual = plain(flatten(resolve_sections([request], Settings())[name]))
+    usual = plain(flatten(resolve_sections([request], Settings({"run": {"period": common}}))[name]))
     flat[name] = {
         key: value
         for key, value in flat[name].items()
@@ -129,8 +130,8 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
     if path.suffix not in TABLES:
         raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(TABLES)}")
     table = read_table("log", path)
-    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, (("period", _period(path, table)),), robot, sensing)
-    return resolve(request, Settings()), table
+    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
+    return resolve(request, Settings({"run": {"period": _period(path, table)}})), table
 
 
 def _period(path: Path, table: pd.DataFrame) -> float:

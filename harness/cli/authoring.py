@@ -173,7 +173,7 @@ def identify(
     from servobench.harness.run.experiment import build
     from servobench.harness.run.identification import read_log
     from servobench.harness.run.preflight import mistakes
-    from servobench.harness.run.request import find_sensing
+    from servobench.harness.run.request import RunSettings, find_sensing
     from servobench.harness.run.twin_file import estimates, remarks, twin_text
     from servobench.plant.robot.catalogue import ROBOTS, find_robot, with_files
 
@@ -200,7 +200,7 @@ def identify(
     if found is None:
         say(f"{log}: {mistake}")
         sys.exit(FAILED)
-    print_tables([(f"{log} against a {own.title}, where they differ", estimates(found, response))])
+    print_tables([(f"{log} against the nominal {own.title}, where they differ", estimates(found, response))])
     say("\n".join(remarks(rows, found, response)))
     if out is not None:
         with accessing(out):
@@ -211,7 +211,9 @@ def identify(
             )
             text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
-        say(f"twin in {out}; the next command: servobench compare --robot {quote(str(out))} --plants kinematic")
+        clock = f" --set run.period={resolved.run.period:g}" * (resolved.run.period != RunSettings.period)
+        next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic{clock}"
+        say(f"twin in {out}; the next command: {next_one}")
 
 
 def _logged(

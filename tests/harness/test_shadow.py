@@ -91,6 +91,22 @@ def test_settings_are_read_from_a_folder_that_counts_probing_in_periods(tmp_path
     np.testing.assert_array_equal(commands(shadow(resolved, steps)), commands(steps))
 
 
+def test_a_log_at_the_rate_of_its_camera_gets_no_remark_on_frames(steps, tmp_path, caplog):
+    camera = tmp_path / "camera.toml"
+    camera.write_text("width = 640\nheight = 480\nvertical_fov = 42.6\nrate = 15.0\n", encoding="utf-8")
+    own_log(steps).assign(time_s=0.067 * np.arange(len(steps))).to_csv(tmp_path / "log.csv", index=False)
+    resolved, _ = logged_in_file(tmp_path / "log.csv", "constant", f"ur5 with {camera}", "position")
+    assert (resolved.run.period, resolved.plant.sensing.frame_period) == (0.067, 0.067)
+    assert not caplog.text
+
+
+def test_a_folder_does_not_run_the_users_code_that_it_names(refusal_of, tmp_path):
+    code = tmp_path / "proportional.py"
+    code.write_text(PROPORTIONAL, encoding="utf-8")
+    compare([str(code)], tasks=["exp2"], settings={"exp2": {"duration": 0.5}}, out=tmp_path / "runs")
+    assert f"controller {code}; name it by --controller if you trust it" in refusal_of("shadow", tmp_path / "runs")
+
+
 def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp_path, monkeypatch):
     (tmp_path / "proportional.py").write_text(PROPORTIONAL, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
