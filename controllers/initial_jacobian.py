@@ -225,6 +225,6 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
         return KnownJacobian(lambda q: np.broadcast_to(given, (*q.shape[:-1], *given.shape)), spec)
     if model is None:
         raise ValueError(
-            "initial.source 'nominal' needs a nominal model, and this plant has none; take 'probe' or 'given' instead"
+            "source 'nominal' needs a nominal model, and this plant has none; set initial.source to 'probe' or 'given'"
         )
     return KnownJacobian(model, spec)

@@ -141,7 +141,7 @@ def test_the_nominal_model_is_evaluated_at_the_start_and_a_given_jacobian_is_tak
 @pytest.mark.parametrize(
     ("settings", "reach", "message"),
     [
-        ({}, 1.0, r"^initial.source 'nominal' needs a nominal model.*take 'probe' or 'given'"),
+        ({}, 1.0, r"source 'nominal' needs a nominal model.*set initial.source to 'probe' or 'given'"),
         *(
             ({"source": "given", "given": given}, 1.0, "^initial.given must hold 1 rows of 2 entries")
             for given in ((), ((1.0,),), ((1.0, 2.0), (3.0,)))
