@@ -12,4 +12,6 @@ subprocess.run([sys.executable, "-m", "servobench", *command.split()], check=Tru
 
 runs = pd.read_parquet("turned/runs.parquet")
 print(runs["status"].value_counts().to_string())
+settled = runs["settling_time_s"].where(runs["status"] == "completed")
+runs["settling_time_s"] = settled.fillna(float("inf"))  # of runs that never settled, which a median would leave out
 print(runs.pivot_table(index="magnitude", columns="controller", values="settling_time_s", aggfunc="median"))
