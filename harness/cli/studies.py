@@ -65,7 +65,7 @@ def sweep(
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say_aids(out)
     say(f"table in {out / results.RUNS}")
-    judge(out, results.iterate_runs(out, ("status",)), strict=running.strict)
+    judge(out, strict=running.strict)
 
 
 def robustness(
@@ -86,7 +86,6 @@ def robustness(
 
     The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
-    from servobench.harness.batch import results
     from servobench.harness.batch.plan import Batch, parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.run.request import find_robot
@@ -101,7 +100,7 @@ def robustness(
     with watching(console, out, running.execution()) as how:
         files = make_map(out, batch, settings, how, lines)
     say(f"the map is in {files[0]}; its runs are in {out}")
-    judge(out, results.iterate_runs(out, ("status",)), strict=False)
+    judge(out, strict=False)
 
 
 def suite(
@@ -364,7 +363,9 @@ def analyse(
         write_csv(table, out / TABLE)
         text = printed(table)
         page = write_pictures(out, loops, text, LEGEND)[0]
+    identified = ", ".join(loop.name for loop in loops if loop.model == "identified")
     title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
+    title += f"; identified in small motions: {identified}" * bool(identified)
     print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
     say(f"table in {out / TABLE}, pictures in {page}")
 

@@ -30,3 +30,10 @@ def test_the_loop_of_another_arm_is_analysed_and_can_be_identified(output_of, mo
         assert table["model"].tolist() == ["identified" if identified else "linearised"]
         margins.append(table["delay_margin_s"].iloc[0])
     assert 0.0 < margins[1] != margins[0]
+
+
+def test_the_title_names_loops_that_are_identified(output_of, monkeypatch, tmp_path):
+    monkeypatch.setattr("servobench.harness.pictures.loops.write_pictures", lambda folder, *_: [folder])
+    own = "docs/examples/own_controller.py:ResolvedRate"
+    printed = output_of("analyse", "pid+true", own, "--out", str(tmp_path))
+    assert "the true Jacobian; identified in small motions: ResolvedRate" in " ".join(printed.split())
