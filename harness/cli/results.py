@@ -16,8 +16,6 @@ from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     import pandas as pd
 
 SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
@@ -212,18 +210,17 @@ def print_faults(folder: Path, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def judge(folder: Path, tables: Iterable[pd.DataFrame], *, strict: bool) -> None:
+def judge(folder: Path, *, strict: bool) -> None:
     """Say how many runs of a finished batch failed and where their traces are; end with exit code 1 if that counts.
 
     Args:
         folder: its results.
-        tables: its runs, in parts.
         strict: whether a run that failed makes the command fail.
     """
     from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
 
-    completed = [table["status"] == COMPLETED for table in tables]
+    completed = [table["status"] == COMPLETED for table in results.iterate_runs(folder, ("status",))]
     count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
     if not failed:
         return

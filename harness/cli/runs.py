@@ -191,4 +191,4 @@ def _carry_out(
             except (ConfigurationError, ImportError) as error:  # the runs are safe, and the report can be made again
                 missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
                 say(f"no report: {missing or error}")
-    judge(folder, [runs], strict=strict)
+    judge(folder, strict=strict)

@@ -173,6 +173,8 @@ def of_schema_3(folder: Path) -> None:
         (of_schema_3, "verify DIR", "DIR has results of schema '3'; this servobench reads '4'; the column "
          "latency_periods [periods] is now latency_s [s]"),
         (lambda folder: None, "verify DIR", "DIR is not a results folder: it does not exist"),
+        (lambda folder: sweep(folder / "slow"), "statistics DIR", "DIR is not a results folder: take one that is in "
+         "it, such as DIR/slow"),
     ],
 )  # fmt: skip
 def test_what_a_folder_lacks_is_named(refusal_of, monkeypatch, tmp_path, make, command, words):
