@@ -4,10 +4,11 @@
 
 with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 
-    I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt)
+    I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + T)
 
-γ/dt tends to K_p at fast rates; so the error decays as exp(−K_p t) at every rate. K_i = K_d = 0 and δ = 0 is eq. 43
-(and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
+T is the time since the last valid feature, that of e(k−1), dt if none is lost. γ/dt tends to K_p at fast rates; so the
+error decays as exp(−K_p t) at every rate. K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to
+the paper's error y − y_ref.
 """
 
 import math
@@ -46,8 +47,8 @@ class PidState(NamedTuple):
     integral: FloatArray  # I, (..., m), m s
     derivative: FloatArray  # d, (..., m), m/s
     last_error: FloatArray  # e of the last valid feature, (..., m), m
-    started: BoolArray  # (...), whether there was a valid feature
     integral_before: FloatArray  # I of the period before, (..., m), m s
+    since_feature: FloatArray  # T, (...), s; inf before there is one
 
 
 @final
@@ -66,8 +67,8 @@ class PidLaw(Law[PidState]):
 
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
-        zero, no = np.zeros(observation.feature.shape), np.full(observation.feature.shape[:-1], False)
-        return PidState(integral=zero, derivative=zero, last_error=zero, started=no, integral_before=zero)
+        zero, never = np.zeros(observation.feature.shape), np.full(observation.feature.shape[:-1], np.inf)
+        return PidState(integral=zero, derivative=zero, last_error=zero, integral_before=zero, since_feature=never)
 
     def command(
         self, state: PidState, estimate: Estimate, observation: Observation, reference: FloatArray
@@ -75,10 +76,9 @@ class PidLaw(Law[PidState]):
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
         config = self._config
         e = reference[..., 0, :] - observation.feature
-        state = state._replace(integral_before=state.integral)
+        state = state._replace(integral_before=state.integral, since_feature=state.since_feature + self._dt)
         state = branch(observation.feature_valid, self._learn, state, e)
-        v = self._rate * e + config.integral_gain * state.integral
-        v = v + config.derivative_gain * state.derivative
+        v = self._rate * e + config.integral_gain * state.integral + config.derivative_gain * state.derivative
         return state, np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
 
     def noted(self, state: PidState, joint_velocity: FloatArray, limited: BoolArray) -> PidState:
@@ -92,10 +92,8 @@ class PidLaw(Law[PidState]):
         return {"integral_norm": norm(state.integral)}
 
     def _learn(self, state: PidState, e: FloatArray) -> PidState:
-        """Integrate and differentiate the error of a valid feature."""
-        state = branch(state.started, self._differentiate, state, e)
-        return state._replace(integral=state.integral + self._dt * e, last_error=e, started=state.started | True)
-
-    def _differentiate(self, state: PidState, e: FloatArray) -> PidState:
-        tau = self._config.derivative_filter
-        return state._replace(derivative=(tau * state.derivative + e - state.last_error) / (tau + self._dt))
+        """Integrate and differentiate the error of a valid feature; the first one has no derivative."""
+        tau, passed = self._config.derivative_filter, state.since_feature
+        derivative = (tau * state.derivative + e - state.last_error) / (tau + passed)[..., None]
+        integral = state.integral + self._dt * e
+        return PidState(integral, derivative, e, state.integral_before, since_feature=np.zeros_like(passed))
