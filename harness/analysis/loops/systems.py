@@ -163,7 +163,8 @@ class Margins:
     delay_margin_s: float  # additional latency of the camera at which the loop becomes unstable; inf if there is none
     crossover_rad_s: float  # largest frequency at which a locus at the feature crosses the unit circle; 0 if none
     sensitivity_peak: float  # M_s, at the feature [1]
-    complementary_peak: float  # max σ̄(T), at the feature [1]
+    # max σ̄(T), at the feature [1]; up to 4 % low for a slow loop, whose peak, T = I at rest, is below the axis
+    complementary_peak: float
     disk_margin: float  # α, at the feature [1]
 
 
