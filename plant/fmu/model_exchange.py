@@ -46,11 +46,10 @@ class FmuModel:
         root = extract_fmu(path)
         read_exchange(path, root)
         self._feature = _feature_function(path, root, joints, features, parameters)
-        q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
+        q: Any = casadi.MX.sym("joint_position", self._feature.size1_in(0))
         y = self._feature(q)
-        outputs: list[Any] = [y, casadi.jacobian(y, q)]
-        create: Any = casadi.Function  # its annotations do not know MX
-        self.function = create("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+        outputs = [y, casadi.jacobian(y, q)]
+        self.function = casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
 
     def symbolic(self, joint_position: Any) -> Any:  # noqa: ANN401 - CasADi expressions
         """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
@@ -115,14 +114,13 @@ def _feature_function(
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]  # The other lines name places in CasADi's code.
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
-    q = casadi.MX.sym("joint_position", len(joints))
+    q: Any = casadi.MX.sym("joint_position", len(joints))
     place = {name: i for i, name in enumerate(joints)}
     rest = dict(zip(states, _starts(builder, states), strict=True))
     x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))
     inputs = casadi.DM(_starts(builder, list(builder.u())))
     feature = whole(x, inputs, casadi.DM([float(values[name]) for name in constants]))
-    create: Any = casadi.Function  # its annotations do not know MX
-    return create("feature", [q], [feature], ["joint_position"], ["feature"])
+    return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 
 def _starts(builder: Any, names: list[str]) -> list[float]:  # noqa: ANN401 - a casadi.DaeBuilder
