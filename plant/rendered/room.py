@@ -86,23 +86,17 @@ class Room:
         if len(points) == 1:
             urdf.draw_mesh(link, RED, urdf.BALL_MESH, self.robot.workspace.ball_radius)
             return
-        normal = _normal(points)
-        if len(points) > len(MARK_COLOURS) or not normal.any():
+        normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
+        length = np.linalg.norm(normal)
+        if len(points) > len(MARK_COLOURS) or not length > 1e-9:
             wanted = "a ball, of one point, or a plate with three or four discs that are not in line"
             came = f"sensing {model.setup.name} has a target of {len(points)} points"
             raise ValueError(f"{came}; only these can be drawn: {wanted}")
-        back, middle = LAYER * scale * normal, points.mean(axis=0)
+        back, middle = LAYER * scale * (normal / length), points.mean(axis=0)  # away from the side of the discs
         for point, colour in zip(points, MARK_COLOURS, strict=False):
             urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
             urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
             urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
-
-
-def _normal(points: FloatArray) -> FloatArray:
-    """Return the unit normal of a plate, (3,), away from the side of its discs; zeros where there is none."""
-    normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
-    length = np.linalg.norm(normal)
-    return np.asarray(normal / length if length > 1e-9 else np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

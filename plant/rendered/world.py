@@ -33,10 +33,8 @@ from servobench.plant.robot.ur5 import UR5
 
 CONTACT_STEPS = 10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
 LAST_ON_TABLE = 1  # base and shoulder stand on the table
-BUILT_INTO_EACH_OTHER: set[int | str] = {
-    0,
-    2,
-}  # base and upper arm, whose housings meet inside the shoulder in every pose
+# Base and upper arm, whose housings meet inside the shoulder in every pose.
+BUILT_INTO_EACH_OTHER: set[int | str] = {0, 2}
 
 
 class Contacts:
