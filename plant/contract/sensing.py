@@ -184,16 +184,14 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
         ValueError: a magnitude out of the bounds of its setting, or two families of noise.
     """
     changes: dict[str, Any] = {}
-    families: list[Family] = []
     for name, written, size in axes:
         axis = SENSOR_AXES[name]
         check_field(name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size)
         changes[axis.setting] = size
         if axis.family is not None:
-            families.append(axis.family)
+            if "noise" in changes:
+                raise ValueError(f"noise is of one family, got {changes['noise']} and {axis.family}; give one of them")
             changes["noise"] = axis.family
-    if len(families) > 1:
-        raise ValueError(f"noise is of one family, got {families[0]} and {families[1]}; give one of them")
     return changes
 
 
