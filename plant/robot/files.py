@@ -123,21 +123,19 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
         remark(f'robot file {path} is read by the standard convention; write convention = "standard" or "modified"')
     table = override(f"robot file {path}", DhTable((), (), (), (), (), ()), values)
     with configuration_errors(f"robot file {path}: "):
-        return _robot_of(table, path)
-
-
-def _robot_of(table: DhTable, path: Path) -> Robot:
-    arm = with_ball(_arm_of(table))
-    n = arm.n
-    given = (as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
-    limits = JointLimits(*given)
-    mass, torque = (as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque"))
-    links = estimate_links(arm, mass, torque)
-    workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
-    name = table.name or path.stem
-    estimated = "masses, inertia and torque limits are estimated from the lengths of the links"
-    note = "" if table.mass else f"{name}: {estimated}"
-    return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
+        arm = with_ball(_arm_of(table))
+        n = arm.n
+        given = (as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
+        limits = JointLimits(*given)
+        mass, torque = (
+            as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque")
+        )
+        links = estimate_links(arm, mass, torque)
+        workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        name = table.name or path.stem
+        estimated = "masses, inertia and torque limits are estimated from the lengths of the links"
+        note = "" if table.mass else f"{name}: {estimated}"
+        return Robot(name, name, path.name, arm, limits, links, workspace, note=note)
 
 
 def _arm_of(table: DhTable) -> SerialArm:
