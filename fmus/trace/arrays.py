@@ -78,9 +78,14 @@ class Traced(NDArrayOperatorsMixin):
 
     def flat(self) -> Expression:
         """Return its entries as an expression (size, 1), in row-major order."""
+        content, places = self.buffer.content, self.places.reshape(-1)
         if self.constant:
-            return casadi.MX(casadi.DM(self.buffer.content[self.places.reshape(-1)]))
-        return gathered(self.buffer.content, self.places)
+            return casadi.MX(casadi.DM(content[places]))
+        if places.size == content.numel() and np.array_equal(places, np.arange(places.size)):
+            return content
+        if content.numel() == 1:
+            return casadi.repmat(content, places.size, 1)
+        return content.nz[places.tolist()] if places.size else casadi.MX(0, 1)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:  # noqa: ANN401
         """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
@@ -210,16 +215,6 @@ def as_numbers(value: Any) -> Any:  # noqa: ANN401 - an array, or lists and tupl
     if type(value) in {list, tuple}:
         return type(value)(map(as_numbers, value))
     return value.numbers() if isinstance(value, Traced) else value
-
-
-def gathered(content: Expression, places: Places) -> Expression:
-    """Return entries of an expression (N, 1) as one (size, 1)."""
-    flat = places.reshape(-1)
-    if flat.size == content.numel() and np.array_equal(flat, np.arange(flat.size)):
-        return content
-    if content.numel() == 1:
-        return casadi.repmat(content, flat.size, 1)
-    return content.nz[flat.tolist()] if flat.size else casadi.MX(0, 1)
 
 
 def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
