@@ -21,7 +21,6 @@ from servobench.fmus.variables import (
     SAMPLED,
     STATE,
     ArmLayout,
-    Group,
     Layout,
 )
 from servobench.plant.contract.checks import FloatArray
@@ -255,7 +254,8 @@ def _variables(parent: ET.Element, description: Description, version: int) -> No
         for k, name in enumerate(group.scalar_names() if version == 2 else [group.name]):
             attributes = {"name": name, "valueReference": str(first + k), **ATTRIBUTES[group.role]}
             attributes["description"] = group.description
-            real = _real(group)
+            bounds = {"displayUnit": DISPLAY_UNITS.get(group.unit), "min": group.minimum, "nominal": group.nominal}
+            real = {"unit": group.unit} | {name: str(bound) for name, bound in bounds.items() if bound is not None}
             if group.role in (PARAMETER, FIXED, INPUT):
                 real["start"] = starts[k] if version == 2 else " ".join(starts)
             if group.role == DERIVATIVE:
@@ -270,11 +270,6 @@ def _variables(parent: ET.Element, description: Description, version: int) -> No
     if version == 3:
         time = {"causality": "independent", "variability": "continuous", "unit": "s", "description": "Simulation time."}
         ET.SubElement(parent, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
-
-
-def _real(group: Group) -> dict[str, str]:
-    bounds = {"displayUnit": DISPLAY_UNITS.get(group.unit), "min": group.minimum, "nominal": group.nominal}
-    return {"unit": group.unit} | {name: str(bound) for name, bound in bounds.items() if bound is not None}
 
 
 def _dependent(dependencies: list[int]) -> dict[str, str]:
