@@ -55,7 +55,6 @@ LOG_CATEGORIES = {
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 
-
 _Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, its dependencies, elementwise or as a whole
 
 

@@ -25,7 +25,6 @@ from servobench.plant.robot.hand_eye import RobotModel
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
 
-
 FEATURE: Final = "feature"
 BALL: Final = "ball_position"  # name of the feature without a set-up of cameras
 SEEN: Final = "seen"

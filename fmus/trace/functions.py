@@ -26,8 +26,6 @@ from servobench.fmus.trace.arrays import (
 from servobench.fmus.trace.branches import NOT_DEFINITE, note_fault
 
 SWEEPS: Final = 10  # sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors
-
-
 ARRANGES: Final = frozenset(
     {
         np.reshape, np.swapaxes, np.moveaxis, np.transpose, np.diagonal, np.repeat, np.broadcast_to, np.flip,

@@ -25,8 +25,6 @@ from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 
 Expressions: TypeAlias = npt.NDArray[Any]
 """An array of CasADi expressions."""
-
-
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 
 

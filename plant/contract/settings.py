@@ -138,8 +138,6 @@ _WANTED = {
     "mapping_type": "a section",
     "dict_type": "a section",
 }
-
-
 STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 
 

@@ -39,7 +39,6 @@ STRUCTURAL: Final = "structuralParameter"
 INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
 EXACT: Final = 2**53  # largest number up to which float64 holds all whole numbers
 
-
 Setter = Callable[[Instance, int], None]
 
 

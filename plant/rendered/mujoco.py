@@ -47,8 +47,6 @@ MAX_PARTS = 1000  # largest number of drawn parts
 SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
 COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
-
-
 # MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
 KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="false" strippath="true"/></mujoco>'
 
