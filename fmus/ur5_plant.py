@@ -1,9 +1,8 @@
 """The plant `fmu`: the exported arm, built on first use and kept in the user's cache folder."""
 
-import math
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -14,36 +13,22 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.faults import configuration_errors
-from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Delay, JointSpeed, NonNegative, Positive, Usual, nested, settings
+from servobench.plant.contract.settings import Delay, NonNegative, settings
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.mechanics import MechanicsConfig
+from servobench.plant.kinematic import ArmConfig, KinematicConfig
 from servobench.plant.robot.robot import Robot
 
 
 @settings
-class Ur5FmuConfig:
-    """Settings of the exported arm; the same as those of the kinematic plant."""
+class Ur5FmuConfig(ArmConfig):
+    """Settings of the exported arm."""
 
     fmi_version: Literal[2, 3] = 2
     """Version of FMI."""
-    max_joint_speed: JointSpeed = 1.0
-    """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
-    joint_range: Annotated[Positive, Usual(4 * math.pi)] = 2 * math.pi
-    """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
-    lag: Delay = 0.05
-    """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     joint_lags: tuple[Delay, ...] = ()
     """[s] τ of each of the joints in place of `lag`; an empty list for none."""
     encoder_resolution: NonNegative = 0.0
     """[rad] step of reported positions; 0 means exact ones, as those of `kinematic`."""
-    command_delay: Delay = 0.05
-    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
-    sensing: SensingConfig = nested(SensingConfig)
-    """Noise, latency, frame period and lost frames."""
-    mechanics: MechanicsConfig = nested(MechanicsConfig)
-    """Backlash and ripple of the gears, and a flexible tool."""
 
 
 @cache

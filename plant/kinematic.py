@@ -30,8 +30,8 @@ from servobench.plant.robot.mechanics import MechanicsConfig, Motion, Tool
 
 
 @settings
-class KinematicConfig:
-    """Settings of the kinematic plant; defaults are those of an arm under a stereo camera."""
+class ArmConfig:
+    """Settings of this plant and of the exported arm; defaults are those of an arm under a stereo camera."""
 
     max_joint_speed: JointSpeed = 1.0
     """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
@@ -39,14 +39,20 @@ class KinematicConfig:
     """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
     lag: Delay = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
-    overshoot: ShareBelowOne = 0.0
-    """[1] of a step of the velocity: above 0 velocity loops swing at 1/τ, as stiff ones under unexpected loads do."""
     command_delay: Delay = 0.05
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     mechanics: MechanicsConfig = nested(MechanicsConfig)
     """Backlash and ripple of the gears, and a flexible tool."""
+
+
+@settings
+class KinematicConfig(ArmConfig):
+    """Settings of the kinematic plant."""
+
+    overshoot: ShareBelowOne = 0.0
+    """[1] of a step of the velocity: above 0 velocity loops swing at 1/τ, as stiff ones under unexpected loads do."""
 
     def __post_init__(self) -> None:
         """Check across fields."""
