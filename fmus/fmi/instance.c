@@ -122,12 +122,6 @@ static const char *check(Variables variables, size_t end)
     return k < variables.n_values ? TOO_MANY : k > variables.n_values ? TOO_FEW : NULL;
 }
 
-/* Turns `direction`, set for the knowns, into the derivatives of all values along it. */
-static const char *derive(Core *core, double direction[N_VALUES])
-{
-    return model_derive(&core->model, direction, core->phase == INITIALISING);
-}
-
 const char *core_derive(Core *core, Variables unknowns, Variables knowns, const double seed[], double product[])
 {
     double direction[N_VALUES] = {0.0};
@@ -136,7 +130,7 @@ const char *core_derive(Core *core, Variables unknowns, Variables knowns, const 
     for (size_t i = 0; message == NULL && i < knowns.count; seed += size_of(knowns.references[i++])) {
         memcpy(direction + knowns.references[i], seed, size_of(knowns.references[i]) * sizeof(double));
     }
-    if (message == NULL) message = derive(core, direction);
+    if (message == NULL) message = model_derive(&core->model, direction, core->phase == INITIALISING);
     for (size_t i = 0; message == NULL && i < unknowns.count; product += size_of(unknowns.references[i++])) {
         memcpy(product, direction + unknowns.references[i], size_of(unknowns.references[i]) * sizeof(double));
     }
@@ -164,7 +158,7 @@ const char *core_derive_adjoint(Core *core, Variables unknowns, Variables knowns
         for (size_t j = 0; message == NULL && j < size_of(first); j++) {
             double direction[N_VALUES] = {0.0};
             direction[first + j] = 1.0;
-            message = derive(core, direction);
+            message = model_derive(&core->model, direction, core->phase == INITIALISING);
             if (message == NULL) *product++ = weighed(direction, unknowns, seed);
         }
     }
