@@ -55,10 +55,6 @@ class FmuModel:
         """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
         return self._feature(joint_position)
 
-    def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return the feature, (m,), at joint positions (n,) in rad."""
-        return np.asarray(self._feature(np.asarray(joint_position)), dtype=np.float64).ravel()
-
     def jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂feature/∂(joint position), (..., m, n), at joint positions (..., n) in rad."""
         q = np.asarray(joint_position, dtype=np.float64)
