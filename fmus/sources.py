@@ -73,9 +73,8 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], constants: Ma
     settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
     zero = np.zeros(1)
     values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
-    minima = [
-        "-HUGE_VAL" if each.minimum is None else each.minimum.hex() for each in settable for _ in range(each.size)
-    ]
+    least = [group.minimum for group in settable for _ in range(group.size)]
+    minima = ["-HUGE_VAL" if each is None else each.hex() for each in least]
     macros = {
         "TOKEN": f'"{token}"',
         "N_GROUPS": len(layout.groups),

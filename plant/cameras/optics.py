@@ -150,8 +150,7 @@ def _straightened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatAr
     """Return a, (..., c, p, 2), of which b are the bent ones; Newton's method within the part that is visible."""
     a, most = b, 0.95 * np.sqrt(further[..., 5, None])
     for _ in range(NEWTON_STEPS):
-        slope = _slope(a, k1, further)
-        (xx, xy), (_, yy) = np.moveaxis(slope, (-2, -1), (0, 1))
+        (xx, xy), (_, yy) = np.moveaxis(_slope(a, k1, further), (-2, -1), (0, 1))
         e = _bent(a, k1, further) - b
         step = np.stack([yy * e[..., 0] - xy * e[..., 1], xx * e[..., 1] - xy * e[..., 0]], axis=-1)
         a = a - step / np.maximum(xx * yy - xy * xy, 1e-2)[..., None]

@@ -175,10 +175,8 @@ class SensingSetup:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
         if not isinstance(made, np.ndarray) or made.shape != shape or made.dtype not in FLOATS:
             came = f"{made.dtype} of shape {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
-            wanted = (
-                f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :], got {came}"
-            )
-            raise ConfigurationError(f"sensing {self.name}: {name} must return {wanted}")
+            wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
+            raise ConfigurationError(f"sensing {self.name}: {name} must return {wanted}, got {came}")
         if not np.isfinite(made).all():
             raise ConfigurationError(f"sensing {self.name}: {name} must return finite numbers, got {made.tolist()}")
 
@@ -293,9 +291,8 @@ class SetupModel(RobotModel):
         """Return this model with deviating intrinsics; see `RobotModel.with_lens`."""
         lens, (focal, *shift, bend) = self.optics, deviation
         centre, distortion = lens.centre + np.array(shift), lens.distortion + bend
-        return replace(
-            self, optics=replace(lens, focal=lens.focal * (1.0 + focal), centre=centre, distortion=distortion)
-        )
+        lens = replace(lens, focal=lens.focal * (1.0 + focal), centre=centre, distortion=distortion)
+        return replace(self, optics=lens)
 
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
         """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""
