@@ -237,9 +237,14 @@ def tune(
         interrupted = not _advance(methods, plan, opened)
     if results := write_results(out, methods):
         _print_tuned(results)
+    lost = [name for name, tuned in results.items() if tuned.lost]
+    if len(results) > len(lost):
         say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:
         _end_interrupted(out)
+    if lost:
+        found = f"no run of {', '.join(lost)} came near its target with any settings, so no values are written"
+        raise ConfigurationError(f"{found}; servobench run with the same plant may say why")
 
 
 def _counted(plan: TuningPlan) -> str:

@@ -70,8 +70,10 @@ def test_a_plant_of_the_user_is_tuned_on_and_another_version_of_it_refused(outpu
     output_of(*words)
     assert read_tuned(tmp_path / "out" / "rls.toml").score < objective.WORST
     with (tmp_path / "cell.py").open("a") as file:
-        file.write("# another version")
+        file.write("Cell.advance = None")
     assert "rls.jsonl was made with other plants" in refusal_of(*words)
+    output_of(*words[:-1], tmp_path / "lost", code=2)
+    assert sorted(path.name for path in (tmp_path / "lost").iterdir()) == ["rls.jsonl", "rls.second.jsonl"]
 
 
 def test_ctrl_c_keeps_the_study(tmp_path):

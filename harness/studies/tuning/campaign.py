@@ -11,6 +11,7 @@ are those of the coordinate search: each other value of each switch, and 20 % mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -26,6 +27,7 @@ from servobench.harness.config.settings import default_config, file_stem, flatte
 from servobench.harness.studies.tuning.objective import (
     LEDGER,
     SECOND,
+    WORST,
     Ledger,
     Trial,
     TuningSet,
@@ -223,10 +225,14 @@ def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> It
 
 
 def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
-    """Write `NAME.toml` for every method whose studies are finished, and return their contents by name."""
+    """Return the results of every method whose studies are finished by its name, and write them, `NAME.toml`.
+
+    Results without a run that ended well are of no use and not written.
+    """
     results = {method.name: tuned for method in methods if (tuned := method.result()) is not None}
     for name, tuned in results.items():
-        write_tuned(folder / f"{file_stem(name)}.toml", tuned)
+        if not tuned.lost:
+            write_tuned(folder / f"{file_stem(name)}.toml", tuned)
     return results
 
 
@@ -251,6 +257,11 @@ class TunedValues:
     settings: Mapping[str, Any]  # nested values
     studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
     edges: tuple[str, ...] = ()  # a line for each number at an edge of its box, which is wider in the next study
+
+    @property
+    def lost(self) -> bool:
+        """Whether every run has the worst cost, also with the best values."""
+        return math.isclose(self.second_score, WORST)
 
 
 def edge_lines(name: str, nested: Mapping[str, Any]) -> tuple[str, ...]:
