@@ -164,12 +164,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         check_settings(given, [plant, task])
         self.resolved: Final = resolve(request, given)
         experiment = build(self.resolved)
-        try:
-            check_possible(self.resolved, experiment)
-        except ConfigurationError:
-            experiment.plant.close()
-            raise
-        self._experiment: Experiment | None = experiment
+        experiment.plant.close()  # `reset` builds one for each episode
+        check_possible(self.resolved, experiment)
+        self._experiment: Experiment | None = None
         self._rollout: Rollout | None = None
         self._over = True
         self._spaces = Spaces(experiment.plant.spec, self.resolved.run.preview_rows)
@@ -356,7 +353,6 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         if choice.get("render_mode") is not None:
             raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
         single = ServoEnv(**choice)
-        single.close()
         self._resolved = single.resolved
         if side_by_side_key(self._resolved) is None:
             raise ConfigurationError(
