@@ -6,8 +6,6 @@ process was killed, `load_runs` and `load_steps` read the parts, and `collect` p
 that was changed since is refused by name: `SHA256SUMS` has the checksums of all of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -16,7 +14,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pandas as pd
 import pyarrow as pa
@@ -30,9 +28,6 @@ from servobench.harness.run.result import NETWORKS, RunResult, log_entry
 from servobench.plant.contract.checksums import SUMS, append_sums, digest, fault, keep_sums, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import PARTIAL, accessing, write_atomically
-
-if TYPE_CHECKING:
-    from servobench.plant.bench.plant import ImageArray
 
 PICTURES = "pictures"
 RUNS = "runs.parquet"
@@ -91,16 +86,17 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign:
     files[part_name(index, RUNS)] = partial(tables.write_table, rows, batch=f"{campaign}@{index}")
     with writing(folder):
         for result in outcome:
-            if result.picture is not None:
-                _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result.picture)
+            _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result)
         write_vouched(folder, files)
 
 
-def _write_picture(path: Path, picture: ImageArray) -> None:
+def _write_picture(path: Path, result: RunResult) -> None:
+    if result.picture is None:
+        return
     import cv2  # noqa: PLC0415 - only pictures of cameras need it
 
     path.parent.mkdir(exist_ok=True)
-    large = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     content = cv2.imencode(".png", cv2.cvtColor(large, cv2.COLOR_RGB2BGR))[1].tobytes()
     write_atomically(path, lambda file: file.write_bytes(content))
 
