@@ -183,10 +183,9 @@ def sensor(log: Log, robot: Identified) -> Sensor:
         sensing |= {"occlusions": lost, "occlusion_duration": gap * frame_period(log)}
         lost = 0.0
     rows = frame_period(log) / log.spec.period
-    wait = waiting.mean or 0.5 * log.spec.period * (
-        abs(rows - round(rows)) > MIN_PART
-    )  # until the next control instant
+    wait = 0.5 * log.spec.period if abs(rows - round(rows)) > MIN_PART else 0.0  # until the next control instant
     if waiting.mean:
+        wait = waiting.mean
         noise, outliers, lost = steady, ~kept, max(0.0, lost - waiting.missing)
     latency = max(0.0, robot.estimate("latency")[0] - wait)  # an estimate of 0 may fall below it
     sections: dict[str, dict[str, float]] = {"sensing": sensing, "mechanics": mechanics}
