@@ -39,7 +39,7 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
-from servobench.harness.batch.tables import MAX_TIME, MOST, lacking, unfit_names
+from servobench.harness.batch.tables import MAX_TIME, MOST, TEXTS, lacking, unfit_names
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -59,7 +59,6 @@ from servobench.plant.contract.settings import REMARKS, remark
 
 BLOCK: Final = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
 RUN_ID: Final = "run_id"
-TEXTS: Final = ("robot", "engine", "task_kind", "feature_unit", "reason")  # columns of a row; others are numbers
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
 
 
