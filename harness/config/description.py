@@ -137,9 +137,8 @@ def configuration_file(
 def _line(setting: Setting, default: str) -> str:
     """Return the comment and the line of a setting; one without a value is a comment, too."""
     value, unit = toml(setting.value), f"[{setting.unit}] " if setting.unit else ""
-    facts = "; ".join(
-        part for part in (setting.allowed, f"default {default}" if default else "unset by default") if part
-    )
+    usual = f"default {default}" if default else "unset by default"
+    facts = "; ".join(filter(None, (setting.allowed, usual)))
     words = f"{unit}{setting.meaning or setting.name}".rstrip(".")
     return _comment(f"{words} ({facts})") + (f"{setting.name} = {value}\n" if value else f"# {setting.name} =\n")
 

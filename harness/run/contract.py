@@ -58,8 +58,7 @@ class HeldController(Controller):
         if not isinstance(command, Command):
             text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
             raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
-        if command.joint_velocity.shape != (n,):
-            shape = command.joint_velocity.shape
+        if (shape := command.joint_velocity.shape) != (n,):
             raise WrongAnswer(f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}", method)
         return Command(command.joint_velocity)
 
@@ -180,7 +179,6 @@ def _is_number(value: object) -> bool:
 
 
 def _kind(value: object) -> str:
-    """Return the kind of a value, in a few words."""
     if isinstance(value, np.ndarray):
         return f"ndarray of shape {value.shape}"
     if isinstance(value, type):

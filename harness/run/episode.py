@@ -66,9 +66,9 @@ def carry_out(
         keep_networks(experiment.networks, keep)
     pose = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
     row = _row(experiment.drawn, resolved, ending, _judge(logged, experiment), logged, pose)
-    if not steps:
-        return RunResult(row, None, image, ending.trace)
-    table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(**pose)
+    table = None
+    if steps:
+        table = logged.table(row["run_id"], full_jacobian=experiment.run.full_jacobian).assign(**pose)
     return RunResult(row, table, image, ending.trace)
 
 

@@ -22,7 +22,6 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot import catalogue, ur5
-from servobench.plant.robot.catalogue import WITH
 from servobench.plant.robot.mismatch import Mismatch
 
 DEFAULT_ROBOT: Final = ur5.UR5
@@ -153,7 +152,7 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        robot = "" if self.robot == DEFAULT_ROBOT else f"{short_name(self.robot).replace(WITH, '+')}-"
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{short_name(self.robot).replace(catalogue.WITH, '+')}-"
         sensing = "" if self.sensing == DEFAULT_SENSING else f"{Path(self.sensing).name}-"
         varied = "".join(map(_in_name, self.varied))
         name = f"{self.plant}-{robot}{sensing}{self.controller}-{self.task}-{self.mismatch}{varied}-{self.seed}"
