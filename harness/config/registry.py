@@ -5,15 +5,13 @@ entry-point group `servobench.plants` or `servobench.controllers`; a name of thi
 that a user gives as files or objects are offered under a name for as long as a command or call takes.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias
+from typing import Any, Final, Generic, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import ESTIMATORS, LAWS, METHODS, compose, suggest_pair
@@ -24,9 +22,6 @@ from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
-
-if TYPE_CHECKING:
-    from servobench.plant.rendered.engine import Scene
 
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
@@ -43,9 +38,7 @@ NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY
 CONTROLLERS: Final[Mapping[str, ControllerEntry | str]] = {**METHODS, **NOT_COMPOSED}
 MAPPINGS: Final = (".fmu", ".toml")  # endings of an FMU, or of a mapping of its names
 
-
 Offer: TypeAlias = Own[Any]
-
 _OFFERED: dict[str, Offer] = {}
 
 
@@ -292,13 +285,6 @@ def default_plant() -> tuple[str, str]:
         else:
             return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
     return UNRENDERED, missing[RENDERED[has_no_wheel()]]
-
-
-def scene_of(plant: str) -> type[Scene]:
-    """Return the scenes of a rendered plant's engine; engines load slowly, so only here."""
-    from servobench.plant.rendered.plants import load_engine  # noqa: PLC0415
-
-    return load_engine(plant).scene
 
 
 def rendered_plant(named: str | None = None) -> str:

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from servobench.harness.config.registry import rendered_plant, scene_of
+from servobench.harness.config.registry import rendered_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, check_possible
 from servobench.harness.run.lanes import side_by_side_key
@@ -27,6 +27,7 @@ from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.rendered.detection import ByteArray
+from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
 
@@ -299,7 +300,7 @@ class OutsideScene:
             raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which cannot be rendered")
         robot = find_robot(request.robot)
         self._arm, self._drawn, self._overview = drawn.true.arm, drawn, Overview.of(robot.workspace.scale)
-        self._scene = scene_of(rendered_plant())(Room(self._arm, scenery=True, robot=robot))
+        self._scene = load_engine(rendered_plant()).scene(Room(self._arm, scenery=True, robot=robot))
 
     def picture(self, joint_position: FloatArray, target: FloatArray, *, moved: bool) -> ByteArray:
         """Return the arm, (480, 640, 3), with a cross where features are places and the ball is to be.

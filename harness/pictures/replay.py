@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from servobench.harness.config.registry import rendered_plant, scene_of
+from servobench.harness.config.registry import rendered_plant
 from servobench.harness.pictures.tracks import Track, track_of, values_drawn
 from servobench.harness.run.request import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -24,6 +24,7 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.settings import remark
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -133,7 +134,7 @@ class Replay(AbstractContextManager["Replay"]):
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
         self._run, self._fineness = run, fineness
-        open_scene = scene_of(rendered_plant(str(run.track.row["plant"])))
+        open_scene = load_engine(rendered_plant(str(run.track.row["plant"]))).scene
         self._scene = open_scene(Room(run.model.arm, scenery=True, robot=run.robot))
         self._camera = run.robot.pinhole.reaching(run.robot.workspace.camera_distance)
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]

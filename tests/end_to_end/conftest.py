@@ -4,7 +4,8 @@ import pytest
 
 from kit import rendered
 from kit.plants import plant_parameters
-from servobench.harness.config.registry import RENDERED, scene_of
+from servobench.harness.config.registry import RENDERED
+from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Room
 
 
@@ -34,7 +35,7 @@ def open_scene(engine):
     scenes = []
 
     def build(**options):
-        scenes.append(scene_of(engine)(Room(rendered.MODEL.arm, robot=rendered.UR5, **options)))
+        scenes.append(load_engine(engine).scene(Room(rendered.MODEL.arm, robot=rendered.UR5, **options)))
         return scenes[-1]
 
     yield build

@@ -9,13 +9,14 @@ import pytest
 from kit.own import write
 from kit.rendered import IDEAL
 from kit.robots import FOUR_JOINTS
-from servobench.harness.config.registry import find_plant, scene_of
+from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.detectors import begin_noise, open_detector
+from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
@@ -49,7 +50,7 @@ def open_setup(engine):
 @pytest.mark.parametrize("word", IN_PIXELS)
 def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word, engine):
     model, rng = true_model(word), np.random.default_rng(5)
-    scene = scene_of(engine)(Room(model.arm, scenery=False, robot=UR5, model=model))
+    scene = load_engine(engine).scene(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
     noise = begin_noise(0)
     while poses < 8:
