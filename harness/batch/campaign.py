@@ -165,9 +165,8 @@ def _carry_out_at(
     place: Workers, campaign: Campaign, runs: Survey, own: tuple[Offer, ...], folder: Path, how: Execution
 ) -> None:
     """Check and carry out a campaign at a place."""
-    how = replace(how, block=1) if campaign.timed else how
     sections = check_campaign(campaign, runs, how.observer, place)
-    together = how.block > 1 and not how.debug and not campaign.steps
+    together = how.block > 1 and not (how.debug or campaign.steps or campaign.timed)
     jobs = partial(_jobs, campaign, sections, together)
     side_by_side = _side_by_side([select(request, sections) for request in runs.examples]) if together else {}
     manifest = describe_batch(runs, sections, campaign.settings.sections, side_by_side, own, steps=campaign.steps)
