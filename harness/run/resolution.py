@@ -40,10 +40,8 @@ class Sections(dict[str, Any]):
         self.user, self.given = user, dict[str, frozenset[str]]()
         for name in sections.keys() & user.sections.keys() & defaults.keys():
             usual, own = flatten(defaults[name]), flatten(sections[name])
-            told = (key for key in flatten(user.sections[name]) if key in own)
-            self.given[name] = frozenset(
-                key for key in told if (name, key) not in user.filed or not np.array_equal(own[key], usual[key])
-            )
+            repeated = {key for key in own if (name, key) in user.filed and np.array_equal(own[key], usual[key])}
+            self.given[name] = frozenset(flatten(user.sections[name]).keys() & own.keys() - repeated)
         self._frames: dict[tuple[str, float], Varied] = {}
         self._changed: dict[tuple[str, Varied], Any] = {}
 
