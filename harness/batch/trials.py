@@ -86,9 +86,8 @@ def attempt(
             case ["answer" | "refusal" | "failure" as part, value]:
                 found[part] = value
 
-    end = call(
-        _attempt_here, (function, arguments, quiet, hear is not None), Bounds(limit).limits(1, foreign=True), receive
-    )
+    limits = Bounds(limit).limits(1, foreign=True)
+    end = call(_attempt_here, (function, arguments, quiet, hear is not None), limits, receive)
     if "refusal" in found:
         raise ConfigurationError(str(found["refusal"]))
     return found.get("answer"), str(found.get("failure", "")) if end is None else why(end, limit)

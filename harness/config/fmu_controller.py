@@ -170,9 +170,8 @@ class FmuController(Controller):
             ValueError: it cannot save or serialise its state.
         """
         if not self._description.can_serialise:
-            raise ValueError(
-                f"{self._description.path.name} cannot serialise its state (canSerializeFMUstate is false)"
-            )
+            name = self._description.path.name
+            raise ValueError(f"{name} cannot serialise its state (canSerializeFMUstate is false)")
         return self._instance.save_bytes()
 
     def restore(self, state: object) -> None:

@@ -289,9 +289,8 @@ def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
     for what, values in (("start", scenario.start), ("target", run.task.taught_at)):
         if values is None:
             continue
-        for joint, value, lower, upper in zip(
-            spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True
-        ):
+        limited = zip(spec.joint_names, values, spec.joint_lower, spec.joint_upper, strict=True)
+        for joint, value, lower, upper in limited:
             if not lower <= value <= upper:
                 wanted = f"within the joints' limits, {lower:.4g} to {upper:.4g} rad for {joint}"
                 raise ConfigurationError(f"task {run.request.task}: {what} must be {wanted}, got {value:g}")

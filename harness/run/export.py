@@ -146,11 +146,8 @@ def _run(experiment: Experiment) -> ReferenceRun:
             raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
     time, *columns = (np.array(column) for column in zip(*inputs, strict=True))
     answers = (np.array(column) for column in zip(*outputs, strict=True))
-    return ReferenceRun(
-        time,
-        dict(zip((POSITION, FEATURE, SEEN, REFERENCE), columns, strict=True)),
-        dict(zip((COMMAND, JACOBIAN), answers, strict=True)),
-    )
+    given = dict(zip((POSITION, FEATURE, SEEN, REFERENCE), columns, strict=True))
+    return ReferenceRun(time, given, dict(zip((COMMAND, JACOBIAN), answers, strict=True)))
 
 
 def arm_product(

@@ -62,10 +62,8 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
         f"residuals over time are {'white' if over_time < WHITE else 'not white'}, correlated over "
         f"{robot.correlation:.2g} frames; posture explains {max(0.0, over_posture):.1%} of their variance",
     ]
-    still = [
-        name for name, each in zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True) if each < MIN_MOTION
-    ]
-    if still:
+    motions = zip(log.spec.joint_names, np.ptp(log.joints, axis=0), strict=True)
+    if still := [name for name, motion in motions if motion < MIN_MOTION]:
         lines.append(f"joints that hardly move: {', '.join(still)}")
     if response is None:
         lines.append(f"not told: delay and lag, as {untold_response(log)}")
