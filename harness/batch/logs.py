@@ -70,10 +70,8 @@ def logged_in_folder(
     own = {name: str(told.get("place")) for name, told in manifest.get("own_controllers", {}).items()}
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
         if CODE.search(name := own.get(row.get(word), str(row.get(word, "")))) and name != sensing:
-            raise ConfigurationError(
-                f"{folder} names code that would be run, {word} {name}; "
-                + ("nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it")
-            )
+            remedy = "nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it"
+            raise ConfigurationError(f"{folder} names code that would be run, {word} {name}; {remedy}")
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
@@ -98,13 +96,10 @@ def _settings_of(request: RunRequest, manifest: Mapping[str, Any], *, own: bool)
     read = ["run", name, request.task, *([request.controller] if own else [])]
     common = told.get("run", {}).get("period", RunSettings.period)
     period = dict(request.varied).get("run.period", common)
-    flat = {
-        each: {
-            RENAMED.get(key, key): period * value if key in RENAMED else value
-            for key, value in restored(told.get(each, {})).items()
-        }
-        for each in read
-    }
+    flat = {each: restored(told.get(each, {})) for each in read}
+    for values in flat.values():
+        for old in RENAMED.keys() & values.keys():
+            values[RENAMED[old]] = period * values.pop(old)
     usual = plain(flatten(resolve_sections([request], Settings({"run": {"period": common}}))[name]))
     flat[name] = {
         key: value
