@@ -356,10 +356,8 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         single = ServoEnv(**choice)
         self._resolved = single.resolved
         if side_by_side_key(self._resolved) is None:
-            raise ConfigurationError(
-                f"plant {self._resolved.request.plant} carries out one run at a time: "
-                "gymnasium.make_vec(..., vectorization_mode='async')"
-            )
+            alone = f"plant {self._resolved.request.plant} carries out one run at a time"
+            raise ConfigurationError(f"{alone}: gymnasium.make_vec(..., vectorization_mode='async')")
         self.num_envs = int(num_envs)
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
