@@ -132,9 +132,10 @@ class SensingSetup:
 
     @cached_property
     def _step(self) -> float:
-        """Share of the motions for `_differences`, by the precision in which `measure` computes."""
-        fine, coarse = (self._differences(*self._places(), h) for h in (DIFFERENCE, CHECKED))
-        return DIFFERENCE if np.abs(fine - coarse).max() <= RATE_TOLERANCE * np.abs(coarse).max() else CHECKED
+        """Share of the motions for `_differences`, by whether `measure` tells apart motions that are far smaller."""
+        fine, coarse = (self._differences(*self._places(), h) for h in (RATE_TOLERANCE * DIFFERENCE, CHECKED))
+        lost = np.abs(coarse)[fine == 0.0] > RATE_TOLERANCE * np.median(np.abs(coarse))
+        return CHECKED if lost.any() else DIFFERENCE
 
     def _places(self) -> tuple[FloatArray, FloatArray, Optics]:
         """Return a few places of the target in front of the cameras, two motions of it, and the optics; see `rates`."""
