@@ -272,7 +272,7 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
         look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
         shift = arm.translation[0]
         heights = (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4)))
-        moved = [np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights]
+        moved = [np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()]
         if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
             look = "its joint limits, which forbid all of them"
         elif any(_at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None for each in moved):

@@ -102,9 +102,11 @@ def test_an_arm_that_cannot_reach_its_bench_is_refused():
     pinned = replace(robot.limits, lower=np.full(7, -0.01), upper=np.full(7, 0.01))
     with pytest.raises(ValueError, match="no posture in which its ball is over the table.*look at its joint limits"):
         found(replace(robot, limits=pinned))
-    planar = replace(robot.arm, rpy=np.zeros_like(robot.arm.rpy))
-    with pytest.raises(ValueError, match="no posture .* look at order, units and signs of its lengths and twists"):
-        found(replace(robot, arm=planar))
+    planar, ur5 = replace(robot.arm, rpy=np.zeros_like(robot.arm.rpy)), find_robot("ur5")
+    low = replace(ur5.arm, translation=ur5.arm.translation * (np.arange(7) != 1)[:, None])
+    for wrong in (replace(robot, arm=planar), replace(ur5, arm=low)):
+        with pytest.raises(ValueError, match="no posture .* look at order, units and signs of its lengths and twists"):
+            found(wrong)
     with pytest.raises(ValueError, match=r"three joints or more and links with lengths, got 7 joints and links of 0 m"):
         found(replace(robot, arm=replace(robot.arm, translation=np.zeros_like(robot.arm.translation))))
 
