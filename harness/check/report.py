@@ -15,6 +15,7 @@ from servobench.plant.contract.faults import ConfigurationError, RunFault
 
 Verdict: TypeAlias = Literal["ok", "failed", "note"]
 WIDTH: Final = 14  # of the names of checks, in print
+HAPPENS: Final = "; this happens with "  # begin of the notes of `naming`
 
 
 class Finding(NamedTuple):
@@ -67,7 +68,7 @@ def naming(conditions: str) -> Iterator[None]:
         yield
     except Exception as error:
         if conditions:
-            error.add_note(f"; this happens with {conditions}")
+            error.add_note(f"{HAPPENS}{conditions}")
         raise
 
 
@@ -111,8 +112,8 @@ def _finding(check: Check) -> Finding:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             note = check.carry_out()
     except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
-        conditions = "".join(getattr(error, "__notes__", ()))
-        return Finding(check.name, "failed", _defect(error) + conditions + _remedy(error))
+        notes = (each for each in getattr(error, "__notes__", ()) if each.startswith(HAPPENS))
+        return Finding(check.name, "failed", "".join([_defect(error), *notes, _remedy(error)]))
     return Finding(check.name, "note", note) if note else Finding(check.name, "ok")
 
 

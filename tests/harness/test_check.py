@@ -164,6 +164,16 @@ def test_a_broken_plant_fails_one_check_with_one_line(methods, check, line):
     assert line in report.failures[0].text
 
 
+def test_notes_that_an_error_of_the_checked_code_has_are_left_out():
+    def close(own):
+        error = ValueError("stuck")
+        error.add_note("which jax\nexplains at length")
+        raise error
+
+    (failure,) = servobench.check_plant(plant_with(close=close)).failures
+    assert failure.text.endswith("ValueError: stuck")
+
+
 MOVING, SEEN = "self.spec.period * joint_velocity", "return self.model.feature(self.q)\n\n"
 OTHER = "; this happens with a period of 100 ms and the robot panda"
 
