@@ -323,7 +323,7 @@ FUNCTIONS: Final[Mapping[Any, Callable[..., Any]]] = {
     np.sum: _reduction("add"), np.mean: _mean, np.max: _reduction("maximum"), np.min: _reduction("minimum"),
     np.any: _reduction("logical_or"), np.all: _reduction("logical_and"),
     np.argmin: _extreme("less"), np.argmax: _extreme("greater"), np.cumsum: _cumsum,
-    np.clip: _clip, np.dot: _dot, np.cross: _cross, np.einsum: _einsum,
+    np.clip: _clip, np.dot: _dot, np.cross: _cross, np.linalg.cross: _cross, np.einsum: _einsum,
     np.trace: lambda array, *axes, **named: reduced("add", np.diagonal(array, *axes, **named), axis=-1),
     np.count_nonzero: lambda array, axis=None: reduced("add", elementwise("not_equal", array, 0.0), axis),
     np.copy: lambda array: as_traced(array).copy(),

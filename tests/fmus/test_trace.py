@@ -59,7 +59,7 @@ CASES = {
     "views": lambda a, b: view_written(a) + b,
     "mixed": lambda a, b: written_to_numbers(a) + b[:2],
     "outer_products": lambda a, b: lanes.outer(a, b).sum(axis=-1),
-    "crossed": lambda a, b: np.cross(a, b[0]) + np.cross(a[:, 0], b, axis=0),
+    "crossed": lambda a, b: np.cross(a, b[0]) + np.linalg.cross(a[:, 0], b, axis=0),
     "clipped": lambda a, b: np.clip(a, -0.5, 0.5) + b.T.T,
     "solution": lambda a, b: np.linalg.solve(a @ a.mT + np.eye(3), b) + np.linalg.inv(b @ b.mT + np.eye(3)),
     "factor": lambda a, b: np.linalg.cholesky(a @ a.mT + np.eye(3)) * np.linalg.det(b),
