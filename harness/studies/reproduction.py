@@ -17,11 +17,11 @@ from servobench.harness.analysis.comparison import NO_ESTIMATE
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Execution, carry_out_parts
 from servobench.harness.batch.lock import locked
-from servobench.harness.batch.plan import check_seeds
+from servobench.harness.batch.plan import MAX_SEEDS
 from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import figure_style, method_styles, save_figure
-from servobench.harness.studies.claims import FIRST_SEED, MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
+from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import read_text, write_atomically
 
@@ -55,9 +55,9 @@ def reproduce(
     Raises:
         ConfigurationError: too few or too many robots, a plant that is no UR5, or a folder that cannot be written.
     """
-    if robots < MIN_ROBOTS:
-        raise ConfigurationError(f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, got {robots}")
-    check_seeds(range(FIRST_SEED, FIRST_SEED + robots), f"got --seeds {robots}")
+    if not MIN_ROBOTS <= robots <= MAX_SEEDS:
+        wanted = f"at least {MIN_ROBOTS} to tell methods apart, and at most {MAX_SEEDS:,}"
+        raise ConfigurationError(f"--seeds must be {wanted}, got {robots}")
     if any(find_plant(name).own_robot for name in plants):
         raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
     made = {division: studies(plants, robots, division, mismatch) for division in divisions}

@@ -219,7 +219,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("robustness", "--out", "new", "--plant", "kinematic", "--set", "exp2.duration=3"), "'exp2' does not run here"),
     (("claims", "--out", "new", "--division", "equiped"), "'equiped' is not one of 'equipped', 'published'"),
     (("claims", "--out", "new", "--seeds", "2"), "--seeds must be at least 6"),
-    (("claims", "--out", "new", "--seeds", "1000001"), "seeds must name at most 1,000,000, got --seeds 1000001"),
+    (("claims", "--out", "new", "--seeds", "1000001"), "methods apart, and at most 1,000,000, got 1000001\n"),
     (("claims", "--out", "new", "--check", "none.csv"), "answers none.csv cannot be read: No such file or directory"),
     (("claims", "--out", "new", "--check", "columns.csv"), "columns.csv is not a table of answers, such as answers"),
     (("tune", "--controllers", "ukf_mfa"), "ukf_mfac"),
