@@ -144,6 +144,8 @@ def _dot(a: Any, b: Any) -> Traced:  # noqa: ANN401 - as numpy's
 
 def _cross(a: Any, b: Any, axis: int = -1) -> Traced:  # noqa: ANN401 - as numpy's
     one, other = (as_traced(np.moveaxis(each, axis, -1)) for each in (a, b))
+    if {one.shape[-1], other.shape[-1]} != {3}:
+        raise NotTraceable("it calls numpy.cross, of which only products of three numbers each have an exported form")
     product = one[..., [1, 2, 0]] * other[..., [2, 0, 1]] - one[..., [2, 0, 1]] * other[..., [1, 2, 0]]
     return as_traced(np.moveaxis(product, -1, axis))
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, Self, TypeAlias
 
-from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import reason, user_path
 from servobench.plant.contract.settings import suggest
 
@@ -117,10 +117,12 @@ def _origin(name: str) -> Path | None:
     return Path(spec.origin).resolve() if spec.has_location else Path(f"the built-in {name}")
 
 
-@configuration_errors("the present folder was deleted; change to one that exists: ", FileNotFoundError)
 def present_folder() -> Path:
     """Return the present folder; a `ConfigurationError` says that it was deleted."""
-    return Path.cwd()
+    try:
+        return Path.cwd()
+    except FileNotFoundError as error:
+        raise ConfigurationError("the present folder was deleted; change to one that exists") from error
 
 
 def make_importable(folder: Path) -> None:

@@ -153,6 +153,7 @@ def test_what_ends_a_run_is_said_by_a_code(check, value, code):
         (lambda x: x if x[0] > 0 else -x, "decides by a number"),
         (lambda x: np.linalg.eigh(x[:, None] * x), "numpy.eigh, which has no exported form"),
         (lambda x: np.einsum("i,i->", x, x), "of which only products a bᵀ have an exported form"),
+        (lambda x: np.cross(x, x[:2]), "of which only products of three numbers each have an exported form"),
         (lambda x: np.logaddexp(x, x), "numpy.logaddexp, which has no exported form"),
         (
             lambda x: np.linalg.svd(x[None]),
