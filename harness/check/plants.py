@@ -111,7 +111,8 @@ class PlantChecks:
 
     def repeatable(self) -> None:
         """The same seed gives the same bits."""
-        first, again = ([_bits(each) for each in self._observe(self._plant, 7)] for _ in range(2))
+        plant, commands = self._plant, self._commands()
+        first, again = ([_bits(plant.reset(7)), *map(_bits, map(plant.step, commands))] for _ in range(2))
         if first != again:
             raise CheckFailed(
                 "reset with the same seed gives another run: draw all randomness from it and keep nothing"
@@ -166,15 +167,15 @@ class PlantChecks:
 
     def save(self) -> str | None:
         """A restored state continues with the same bits."""
-        plant = self._plant
+        plant, commands = self._plant, self._commands()
         plant.reset(5)
         try:
             state = plant.save()
         except ValueError as error:
             return f"it cannot be saved: {error}"
-        first = [_bits(plant.step(command)) for command in self._commands(plant)]
+        first = [_bits(plant.step(command)) for command in commands]
         plant.restore(state)
-        if first != [_bits(plant.step(command)) for command in self._commands(plant)]:
+        if first != [_bits(plant.step(command)) for command in commands]:
             raise CheckFailed("after restore the run goes on otherwise: save must return all that step changes")
         return None
 
@@ -196,12 +197,10 @@ class PlantChecks:
         config = self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
         return self.entry.build(config, setup), setup
 
-    def _commands(self, plant: Plant) -> list[Command]:
-        drawn = np.random.default_rng(2).uniform(-SHARE, SHARE, (STEPS, plant.spec.n))
-        return [Command(u) for u in drawn * plant.spec.joint_velocity_limit]
-
-    def _observe(self, plant: Plant, seed: int) -> list[Observation]:
-        return [plant.reset(seed), *(plant.step(command) for command in self._commands(plant))]
+    def _commands(self) -> list[Command]:
+        spec = self._plant.spec
+        drawn = np.random.default_rng(2).uniform(-SHARE, SHARE, (STEPS, spec.n))
+        return [Command(u) for u in drawn * spec.joint_velocity_limit]
 
 
 def _bits(observation: Observation) -> tuple[bytes, bytes, bool]:
