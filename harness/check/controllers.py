@@ -4,6 +4,7 @@ import contextlib
 import io
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
@@ -13,17 +14,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.controllers.methods import AidedController, with_aids
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, at, is_refusal, naming, report
-from servobench.harness.check.rig import (
-    PERIOD,
-    PREVIEW,
-    Conditions,
-    Driver,
-    Rig,
-    Shared,
-    attributes,
-    differing,
-    watching_draws,
-)  # fmt: skip
+from servobench.harness.check.rig import PERIOD, PREVIEW, Driver, Rig, Shared, attributes, differing, watching_draws
 from servobench.harness.config.registry import choose_controller, find_controller, offering
 from servobench.harness.config.settings import default_config, flatten
 from servobench.harness.config.source import describe_at
@@ -309,16 +300,14 @@ class ControllerChecks:
                 raise CheckFailed(f"two runs that advance together have other commands than each alone; {IN_LANES}")
         return None
 
-    def _build(self, preview: int = PREVIEW, period: float = PERIOD) -> tuple[Controller, Rig]:
+    def _build(self, period: float = PERIOD, **conditions: Any) -> tuple[Controller, Rig]:  # noqa: ANN401 - `Conditions`
         rig = Rig(JOINTS, FEATURES, period)
-        knowledge = rig.knowledge(truth=self.entry.needs_truth, preview=preview)
+        rig.conditions = replace(rig.conditions, **conditions)
+        knowledge = rig.knowledge(truth=self.entry.needs_truth)
         return self.entry.build(default_config(self.entry), knowledge), rig
 
-    def _driver(self, seed: int = 0, period: float = PERIOD, **conditions: Any) -> Driver:  # noqa: ANN401 - `Conditions`
-        chosen = Conditions(**conditions)
-        controller, rig = self._build(chosen.preview, period)
-        rig.conditions = chosen
-        return Driver(controller, rig, seed)
+    def _driver(self, seed: int = 0, period: float = PERIOD, **conditions: Any) -> Driver:  # noqa: ANN401 - as above
+        return Driver(*self._build(period, **conditions), seed)
 
 
 def _together(seen: Sequence[Observation]) -> Observation:

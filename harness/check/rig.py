@@ -80,10 +80,11 @@ class Rig(Plant):
         self.farthest = max(self.farthest, float(np.abs(q).max()))
         return MODEL_ERROR * self.jacobian(q)
 
-    def knowledge(self, *, truth: bool = False, preview: int = PREVIEW) -> RobotKnowledge:
+    def knowledge(self, *, truth: bool = False) -> RobotKnowledge:
         """Return the knowledge of a controller; with `truth` also that of an upper bound."""
         side, delays = np.ones(self.spec.n), Delays(0.0, 0.0, 0.0)
-        known = RobotKnowledge(self.spec, preview, self.model_jacobian, region=(-side, side), train=self._train)
+        preview, region = self.conditions.preview, (-side, side)
+        known = RobotKnowledge(self.spec, preview, self.model_jacobian, region=region, train=self._train)
         if not truth:
             return known
         return replace(known, true_jacobian=self.jacobian, true_symbolic=self._symbolic, true_delays=delays)
