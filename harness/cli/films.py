@@ -10,18 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servobench.harness.cli import selection
-from servobench.harness.cli.options import (
-    CONTROLLER,
-    MISMATCH,
-    PLANT,
-    ROBOT,
-    TASK,
-    RunIdOption,
-    Value,
-    named_option,
-    option,
-)
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Value, named_option, option
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -57,7 +47,7 @@ def record(
         Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
     *,
-    run: RunIdOption = None,
+    run: options.RunIdOption = None,
     new: NewRun,
     kinds: Annotated[str, option("NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
     begin: Annotated[float, option("SECONDS", "Time in the run at which the film begins [s].", min=0.0)] = 0.0,
