@@ -233,9 +233,8 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             for column, summary in summaries:
                 heading = metric_heading(column, place)
                 if column == "settling_time_s":
-                    middle = (
-                        settling_times(own).fillna(math.inf).median() if settling_times(own).notna().any() else math.nan
-                    )
+                    times = settling_times(own)
+                    middle = times.fillna(math.inf).median() if times.notna().any() else math.nan
                 else:
                     middle = shown_unit(column, place)[1] * column_of(own, column).median()
                 row[heading] = number(middle, f".{summary.digits}f")

@@ -128,8 +128,7 @@ def _of_one_run(runs: pd.DataFrame) -> str:
 
 def _of_one_controller(runs: pd.DataFrame) -> str:
     sentence = f"`{runs['controller'].iloc[0]}` {asked_of(runs)} in {_share(runs)}"
-    moves, _ = split_tasks(runs)
-    if len(moves) == len(runs) and len(split_conditions(runs)) == 1:
+    if len(split_tasks(runs)[0]) == len(runs) and len(split_conditions(runs)) == 1:
         middle = median_with_interval(settling_times(runs))
         if math.isfinite(middle.value):  # else half of the runs or more never settled
             sentence += f", after a median of {middle.value:.2f} s"
@@ -266,8 +265,7 @@ def _ranked(place: pd.DataFrame, own: pd.DataFrame) -> tuple[list[str], dict[str
 def _leader(words: str, place: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, str], Any]:
     table, metric, shares = judged_values(place), judged_metric(place), _shares(own)
     unit, _ = shown_unit(metric, place)
-    order, against = _ranked(place, own)
-    first, second = order[:2]
+    (first, second, *_), against = _ranked(place, own)
     rivals = [name for name, each in against.items() if each.verdict != "better"]
 
     def median(name: str) -> str:

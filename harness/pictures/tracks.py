@@ -234,9 +234,8 @@ def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
     tracks: dict[str, dict[str, list[Track]]] = {}
     for track in load_tracks(folder, runs, COLUMNS):
         tracks.setdefault(track.row["task"], {}).setdefault(track.row["controller"], []).append(track)
-    never = (
-        runs[(runs["status"] != COMPLETED) & (column_of(runs, "periods") == 0.0)].groupby(["task", "controller"]).size()
-    )
+    unbegun = runs[(runs["status"] != COMPLETED) & (column_of(runs, "periods") == 0.0)]
+    never = unbegun.groupby(["task", "controller"]).size()
     return {
         task: {name: _ensemble(own, int(never.get((task, name), 0)), share) for name, own in named.items()}
         for task, named in tracks.items()

@@ -243,9 +243,8 @@ def _in_words(ratio: float) -> str:
 def _keeps_up(tables: Tables, plant: str) -> Answer:
     compared = {"online": tables[MAIN], "frozen": tables[FROZEN]}
     runs = {name: each[each["controller"] == PROPOSED].set_index(["task", "seed"]) for name, each in compared.items()}
-    both = pd.DataFrame(
-        {name: own["jacobian_error_mean"].where(own["status"] == COMPLETED) for name, own in runs.items()}
-    )
+    errors = {name: own["jacobian_error_mean"].where(own["status"] == COMPLETED) for name, own in runs.items()}
+    both = pd.DataFrame(errors)
     small, panel = margin("jacobian_error_mean", tables[MAIN]), "Jacobian error, online − as trained, mean, %"
     measured, levels, words = [], [], []
     for task in (*MOVES, CIRCLE):

@@ -174,9 +174,8 @@ class Trial:
     def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
-        sections = Sections(
-            resolve_sections(requests, given := Settings(TASKS)) | {self.controller: self.config}, given, {}
-        )
+        given = Settings(TASKS)
+        sections = Sections(resolve_sections(requests, given) | {self.controller: self.config}, given, {})
         return [select(request, sections) for request in requests]
 
     def build(self, runs: Sequence[RunRequest]) -> None:
