@@ -66,9 +66,8 @@ def new(
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
     if module in sys.stdlib_module_names or module in packages_distributions():
-        raise ConfigurationError(
-            f"a Python package is called {module}, which a file of this name would hide; take another"
-        )
+        hidden = f"a Python package is called {module}, which a file of this name would hide"
+        raise ConfigurationError(f"{hidden}; take another")
     with accessing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():

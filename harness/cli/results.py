@@ -51,12 +51,11 @@ def statistics(
     missing = results.describe_missing(folder)
     if as_json:
         sys.stderr.write(f"{missing}\n" * bool(missing))
-        print_json(
-            [
-                {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
-                for place, controllers, pairs in statistics_rows(runs, metric)
-            ]
-        )
+        found = [
+            {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
+            for place, controllers, pairs in statistics_rows(runs, metric)
+        ]
+        print_json(found)
         return
     say(f"% {missing}" if latex and missing else missing)
     tables = statistics_tables(runs, metric)

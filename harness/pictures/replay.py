@@ -81,9 +81,8 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None) -> LoggedRun:
     robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
     names = [str(name) for name in track.table if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
     if len(names) != robot.arm.n:
-        raise ConfigurationError(
-            f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
-        )
+        wanted = f"wanted the {robot.arm.n} of a {robot.title}"
+        raise ConfigurationError(f"run {run_id} has {len(names)} joint positions [rad]; {wanted}")
     model, moved = _true_model(row, robot)
     q, ball = track.table[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)

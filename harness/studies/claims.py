@@ -195,9 +195,8 @@ def _alike(tables: Tables, plant: str) -> Answer:
 
 def _leaving(tables: Tables, plant: str) -> Answer:
     runs = tables[MAIN].assign(time=settling_times(tables[MAIN]).fillna(DURATION))
-    leaving, staying = (
-        runs[runs["task"].isin(tasks)].pivot_table("time", "seed", "controller") for tasks in (LEAVING, STAYING)
-    )
+    parts = (runs[runs["task"].isin(tasks)] for tasks in (LEAVING, STAYING))
+    leaving, staying = (part.pivot_table("time", "seed", "controller") for part in parts)
     cost = leaving - staying  # [s] by seed and controller
     pairs = ((PROPOSED, "ukf_mfac"), ("rbf_pid", "ukf_mfac"), (PROPOSED, "rbf_pid"))
     panel, small = "extra settling time where the region is left, mean, s", margin("settling_time_s", runs)

@@ -61,7 +61,6 @@ LIMITS: Final[Mapping[str, float]] = {
 }
 """Upper ends of boxes that are no choice; a lower end of 0, or of one step, is none either."""
 
-
 _log: Final = partial(FloatDistribution, log=True)
 _SWITCH: Final = CategoricalDistribution((False, True))
 _AIDS: Final[Space] = {
