@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
 from servobench.harness.analysis.loops.systems import largest_gain, loci, sensitivity
 from servobench.harness.pictures.style import (
-    Styles,
     add_legend,
     drawing_of,
     figure_style,
@@ -34,10 +33,11 @@ NYQUIST_REACH = 2.5  # of the axes
 COLUMNS = 3
 
 
-def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
+def draw_loops(loops: Sequence[LoopAnalysis]) -> Figure:
     """Draw the loops side by side."""
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
     (magnitude, nyquist, peaks), (phase, step, limits) = figure.subplots(2, 3)
+    styles = method_styles([loop.name for loop in loops])
     for loop in loops:
         style, response = styles[loop.name], loop.response
         L, frequency = response.at_feature(), response.frequency
@@ -97,9 +97,8 @@ def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFr
     Returns:
         The files, the page first.
     """
-    styles = method_styles([loop.name for loop in loops])
     with figure_style():
-        figures = {"loops": draw_loops(loops, styles), "stability_map": draw_stability_map(loops)}
+        figures = {"loops": draw_loops(loops), "stability_map": draw_stability_map(loops)}
     paths = [path for name, figure in figures.items() for path in save_figure(figure, folder / FIGURES / name)]
     drawings = {name: drawing_of(figure)._asdict() for name, figure in figures.items()}
     text = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8")).substitute(
