@@ -122,9 +122,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         with offering():  # a user's own controllers have their names for as long as the command takes
             function(**values)
 
-    parameters = [
-        Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=hint) for name, default, hint in rows
-    ]
+    keyword = partial(Parameter, kind=Parameter.KEYWORD_ONLY)
+    parameters = [keyword(name, default=default, annotation=hint) for name, default, hint in rows]
     vars(call)["__signature__"] = Signature(parameters)
     call.__annotations__ = {each.name: each.annotation for each in parameters}
     return call
