@@ -67,11 +67,12 @@ def logged_in_folder(
             that cannot be made ready here.
     """
     row, manifest = find_run(folder, run_id), results.read_manifest(folder)
-    own = {name: str(told.get("place")) for name, told in manifest.get("own_controllers", {}).items()}
     for word in ("plant", "sensing", *([] if controller else ["controller"])):
-        if CODE.search(name := own.get(row.get(word), str(row.get(word, "")))) and name != sensing:
+        name = str(row.get(word, ""))
+        place = manifest.get(f"own_{word}s", {}).get(name, {}).get("place")  # of the user's code, whose name may be any
+        if place or (CODE.search(name) and name != sensing):
             remedy = "nothing that a folder names is run" if word == "plant" else f"name it by --{word} if you trust it"
-            raise ConfigurationError(f"{folder} names code that would be run, {word} {name}; {remedy}")
+            raise ConfigurationError(f"{folder} names code that would be run, {word} {place or name}; {remedy}")
     steps = results.load_steps(folder, [row["run_id"]])
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")

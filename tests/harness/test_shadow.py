@@ -100,11 +100,14 @@ def test_a_log_at_the_rate_of_its_camera_gets_no_remark_on_frames(steps, tmp_pat
     assert not caplog.text
 
 
-def test_a_folder_does_not_run_the_users_code_that_it_names(refusal_of, tmp_path):
-    code = tmp_path / "proportional.py"
-    code.write_text(PROPORTIONAL, encoding="utf-8")
-    compare([str(code)], tasks=["exp2"], settings={"exp2": {"duration": 0.5}}, out=tmp_path / "runs")
-    assert f"controller {code}; name it by --controller if you trust it" in refusal_of("shadow", tmp_path / "runs")
+def test_a_folder_does_not_run_the_users_code_that_it_names(refusal_of, tmp_path, monkeypatch):
+    (tmp_path / "proportional.py").write_text(PROPORTIONAL, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for place in ("./proportional.py", "proportional:Mine"):
+        out = tmp_path / place[-4:]
+        compare([f"position={place}"], tasks=["exp2"], settings={"exp2": {"duration": 0.5}}, out=out)
+        assert f"controller {place}; name it by --controller if you trust it" in refusal_of("shadow", out)
+        assert servobench(monkeypatch, "shadow", str(out), "--controller", f"position={place}") == 0
 
 
 def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp_path, monkeypatch):
