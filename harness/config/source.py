@@ -52,7 +52,7 @@ class SourceFile:
         except FileNotFoundError as error:
             beside = [each.name for each in path.parent.glob("*.py")] if path.parent.is_dir() else []
             hint = suggest(path.name, beside) if beside else f"{show(path.parent)} holds no Python file"
-            hint = "a name before = has letters, digits and _ only" if "=" in given else hint
+            hint = "a name before = has letters, digits and _ only" if "=" in given.partition("/")[0] else hint
             raise ConfigurationError(f"there is no file {given}: {hint}") from error
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"{given} cannot be read: {reason(error)}") from error

@@ -193,6 +193,7 @@ def test_a_command_refuses_a_broken_file_with_this_line_and_exit_code_2(refusal_
         ("./mien.py", r"there is no file \./mien\.py: did you mean 'mine\.py'\?"),
         ("nowhere/mine.py", r"there is no file nowhere/mine\.py: nowhere holds no Python file"),
         ("my-own=./mine.py", r"there is no file my-own=\./mine\.py: a name before = has letters, digits and _ only"),
+        ("./a=b/mine.py", r"there is no file \./a=b/mine\.py: a=b holds no Python file"),
         ("./mine.py:Mien", r"\./mine\.py has no 'Mien': did you mean 'Mine'"),
         ("./mine.py:np", r"\./mine\.py:np is of type module, wanted a subclass of servobench\.Controller"),
         ("mine", r"unknown controller 'mine': did you mean your file '\./mine\.py'\?"),
