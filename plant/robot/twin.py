@@ -158,7 +158,7 @@ class Twin:
         if sensing != self.keys.sensing:
             raise ValueError(f"twin {self.path} was logged with --sensing {self.keys.sensing}, got {sensing}")
         if not exact:
-            words = "leave the mismatch out, but for camera_move and words of sensor, gears and tool"
+            words = "leave the mismatch out, and axes, but for camera_move and those of sensor, gears and tool"
             raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")
         return deviated(nominal.with_camera(self.keys.camera.pose.matrix), self.values(seed))
 
