@@ -27,7 +27,6 @@ class ResolvedRate(servobench.Controller):
 
 if __name__ == "__main__":
     runs = servobench.compare([ResolvedRate, "ukf_mfac", "constant"], tasks=["exp2"], seeds=3)
-    runs["settling_time_s"] = runs["settling_time_s"].fillna(
-        float("inf")
-    )  # else medians leave out runs that never settled
+    # Else medians leave out runs that never settled.
+    runs["settling_time_s"] = runs["settling_time_s"].fillna(float("inf"))
     print(runs.groupby("controller")[["settling_time_s", "rms_error"]].median())
