@@ -181,7 +181,7 @@ def divisions(names: Iterable[str]) -> dict[str, list[str]]:
     if not published or len(others) == len(bounds):
         return _parts("", wanted, bounds)
     aided = all(name in bounds or name + PUBLISHED in METHODS for name in others)
-    head = "with aids" if aided else "with aids, and others"
+    head = "with aids" if aided else "others"
     return _parts(head, others, bounds) | _parts("as published", published + bounds, bounds)
 
 
