@@ -191,6 +191,16 @@ def prior(name: str) -> float:
     return PRIORS[kind_of(name)]
 
 
+class _State(NamedTuple):
+    """What the features are computed from."""
+
+    values: dict[str, float]  # θ by name
+    time: FloatArray  # (k,) [s] at which the frames were exposed
+    joints: FloatArray  # (k, n) [rad] behind their gears then
+    model: RobotModel  # at θ
+    frames: FloatArray  # (k, n+1, 4, 4) of its arm
+
+
 class _Problem:
     """Residuals of the valid frames of a log as a function of z = θ / s."""
 
@@ -206,6 +216,7 @@ class _Problem:
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model, self.pace, model = model, 1.0, deviated(model, begin)
+        self._kept: tuple[tuple[bytes, float], _State] | None = None
         latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
         self.spread, latency, turning, pose = self._placed(model, latencies, np.zeros_like(latencies))
         if not pixels:
@@ -228,50 +239,61 @@ class _Problem:
         """Return θ by name."""
         return dict(zip(self.names, (self.scale * z).tolist(), strict=True))
 
-    def _exposed(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-        """Return when the frames were exposed, (k,) s, and the joints behind their gears then, (k, n) rad."""
+    def _at(self, z: FloatArray) -> _State:
+        """Return the state at z, which is kept, as the derivatives are wanted where the errors were."""
+        key = (z.tobytes(), self.pace)
+        if self._kept is None or self._kept[0] != key:
+            values = self.values(z)
+            (time, q), model = self._exposed(values), deviated(self.model, values)
+            self._kept = key, _State(values, time, q, model, model.arm.frames(q))
+        return self._kept[1]
+
+    def _exposed(self, values: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+        """Return when the frames were exposed, (..., k) s, and the joints behind their gears then, (..., k, n) rad."""
         steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
-        for _ in range(8 if values["swing_sin"] or values["swing_cos"] else 0):  # the swing is that at the exposure
+        for _ in range(
+            8 if np.any([values["swing_sin"], values["swing_cos"]]) else 0
+        ):  # the swing is that at the exposure
             phase = self.pace * time
             time = steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
-        q = transmitted(self.motion(time), values["ripple"], RIPPLE_ORDER)
-        return time, q + values["backlash"] * self.play(time)
+        ripple, backlash = (np.expand_dims(values[name], -1) for name in ("ripple", "backlash"))
+        return time, transmitted(self.motion(time), ripple, RIPPLE_ORDER) + backlash * self.play(time)
 
     def _seen(self, model: RobotModel, values: Mapping[str, float], time: FloatArray, ball: FloatArray) -> FloatArray:
-        """Return h, (k, m), by the camera of a model for the ball in the base frame, (k, 3) m, of a rigid tool."""
+        """Return h, (..., k, m), by the camera of a model for the ball in the base frame, (..., k, 3) m."""
         own: Any = model
-        y = own.feature_at(ball[:, None]) if isinstance(model, SetupModel) else own.to_camera(ball)
+        y = own.feature_at(ball[..., None, :]) if isinstance(model, SetupModel) else own.to_camera(ball)
         if "turning" in values:
             y = turned(y - values["compliance"] * self.pull(time), values["turning"] * time)
         return np.asarray(y)
 
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
-        values = self.values(z)
-        (time, q), model = self._exposed(values), deviated(self.model, values)
-        return np.asarray(self.y - self._seen(model, values, time, model.arm.ball_position(q)))
+        values, time, _, model, frames = self._at(z)
+        return np.asarray(self.y - self._seen(model, values, time, model.arm.ball(frames)))
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Return ∂(y − h)/∂z, (p, k, m): of arm and camera by the chain rule, of others by differences."""
-        values = self.values(z)
-        (time, q), model = self._exposed(values), deviated(self.model, values)
-        ball, motions = ball_rates(self.model, values, q)
+        values, time, q, model, frames = self._at(z)
+        ball, motions = ball_rates(self.model, model.arm, q, frames)
         by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
         seen = self._seen(model, values, time, ball)
         # A turned or moved camera sees what the other one would of a ball that moves the other way.
         pose, turn, steps = model.camera, [values[name] for name in CAMERA[:3]], STEP * np.eye(3)
         back, lever = pose[:3, :3] @ (self.model.camera[:3, :3] @ rotation_matrix(turn + steps)).mT, ball - pose[:3, 3]
         motions |= dict(zip(CAMERA, (*(lever @ back.mT - lever) / STEP, *-np.eye(3)), strict=True))
-        by_ball = np.stack([self._seen(model, values, time, ball + each) - seen for each in steps], axis=-1) / STEP
+        moved = self._seen(model, values, time, ball + steps[:, None])
+        by_ball = np.stack([*(moved - seen)], axis=-1) / STEP
         rates = {name: prior(name) * np.matvec(by_ball, motion) for name, motion in motions.items()}
-        for name in set(self.names) - set(motions):
-            other, eye, then, place = {**values, name: values[name] + STEP * prior(name)}, model, time, ball
+        sizes = STEP * np.diag([prior(name) for name in EXPOSURE])[..., None]
+        then, joints = self._exposed(values | {name: values[name] + s for name, s in zip(EXPOSURE, sizes, strict=True)})
+        found = self._seen(model, values, then, ball + np.matvec(by_joint, joints - q))
+        rates |= dict(zip(EXPOSURE, (found - seen) / STEP, strict=True))
+        for name in set(self.names) - set(rates):
+            other, eye = {**values, name: values[name] + STEP * prior(name)}, model
             if name in LENS:
                 eye = self.model.with_camera(pose).with_lens(np.array([other[each] for each in LENS]))
-            elif name in EXPOSURE:
-                then, joints = self._exposed(other)
-                place = ball + np.matvec(by_joint, joints - q)
-            rates[name] = (self._seen(eye, other, then, place) - seen) / STEP
+            rates[name] = (self._seen(eye, other, time, ball) - seen) / STEP
         return -np.stack([rates[name] for name in self.names])
 
     def weighted(self, z: FloatArray, root: FloatArray, weights: FloatArray) -> FloatArray:
@@ -290,6 +312,7 @@ class _Problem:
     def recentred(self, z: FloatArray) -> FloatArray:
         """Take the pose of the camera for that from which it deviates, and return the z that is left."""
         self.model, values = self.model.with_camera(self.pose(z)), self.values(z)
+        self._kept = None
         size = max(abs(values["backlash"]), MIN_PLAY)
         gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
         self.play = CubicSpline(self.log.time, played(gears, size) / size)
@@ -323,8 +346,9 @@ class _Problem:
 
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return places (k, 3) as cameras see them that are turned about their optical axes by angles (..., k) [rad]."""
-    (x, y, z), c, s = places.T, np.cos(angle), np.sin(angle)
+    """Return places (..., k, 3) as cameras see them that are turned about the optical axis by angles (..., k) [rad]."""
+    x, y, z = np.moveaxis(places, -1, 0)
+    c, s = np.cos(angle), np.sin(angle)
     return np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1)
 
 

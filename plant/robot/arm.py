@@ -115,7 +115,7 @@ class SerialArm:
 
     def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""
-        return self._ball(self.frames(joint_position))
+        return self.ball(self.frames(joint_position))
 
     def ball_jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂(ball centre)/∂(reported joint position), (..., 3, n) m/rad, for (..., n) in rad."""
@@ -124,7 +124,7 @@ class SerialArm:
     def ball_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `ball_position` and `ball_jacobian` at the cost of one forward kinematics."""
         frames = self.frames(joint_position)
-        ball = self._ball(frames)
+        ball = self.ball(frames)
         return ball, np.swapaxes(self.motions(frames, ball[..., None, :])[..., 0, :, :], -1, -2)
 
     def motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
@@ -137,7 +137,8 @@ class SerialArm:
         motions *= self.gear_ratio[..., None, :, None]
         return np.asarray(motions)
 
-    def _ball(self, frames: FloatArray) -> FloatArray:
+    def ball(self, frames: FloatArray) -> FloatArray:
+        """Return the ball centre in the base frame, (..., 3) m, for `frames`."""
         flange = frames[..., -1, :, :]
         return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
 

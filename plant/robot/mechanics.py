@@ -108,7 +108,7 @@ class MechanicsConfig:
             raise ValueError("mechanics.tool_frequency needs --sensing position; leave it at 0 with other sensing")
 
 
-def transmitted(q: FloatArray, ripple: float, order: float) -> FloatArray:
+def transmitted(q: FloatArray, ripple: float | FloatArray, order: float) -> FloatArray:
     """Return g = q + r sin(k q), (..., n) rad, for a ripple r [rad] of k periods in a turn."""
     return q + ripple * np.sin(order * q)
 

@@ -80,14 +80,14 @@ def deviated(model: RobotModel, values: Mapping[str, float]) -> RobotModel:
     return model.with_arm(arm).with_camera(pose).with_lens(given(*LENS))
 
 
-def ball_rates(model: RobotModel, values: dict[str, float], q: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the ball of a model that deviates by `values`, (k, 3) m in the base frame, and its derivatives by name.
+def ball_rates(
+    model: RobotModel, arm: SerialArm, q: FloatArray, frames: FloatArray
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return the ball of an arm that deviates from a model's, (k, 3) m in the base frame, and its derivatives by name.
 
     Joints q (k, n) [rad], zeros and gears turn it by z_i × (p − o_i), tool and links move it along axes of frames: each
     derivative, (k, 3) m per unit, is by the reported position of a joint or by a parameter.
     """
-    arm = deviated(model, values).arm
-    frames = arm.frames(q)
     ball = frames[:, -1, :3] @ np.append(arm.tool, 1.0)
     turns = arm.motions(frames, ball[:, None])[:, 0]
     axes = np.insert(frames[..., :3, :3], 0, np.eye(3), axis=1)  # columns; the i-th link is given in the i-th of them
