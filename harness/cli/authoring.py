@@ -192,9 +192,12 @@ def identify(
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
     experiment.plant.close()
-    same = [name for name in ROBOTS if name != request.robot and find_robot(name).n == own.n]
+    apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
-        mistake, found = mistakes(rows, setup.nominal(own), {name: setup.nominal(find_robot(name)) for name in same})
+        mistake, found = mistakes(
+            rows, setup.nominal(own),
+            lambda: {name: setup.nominal(arm) for name in apart if (arm := find_robot(name)).n == own.n},
+        )  # fmt: skip
         response = command_response(rows)
     if found is None:
         say(f"{log}: {mistake}")

@@ -5,7 +5,7 @@ each mistake is undone in turn, then each pair, and named where the log is expla
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from heapq import nsmallest
 from itertools import combinations, count, groupby, islice
 from typing import Final, NamedTuple
@@ -35,6 +35,7 @@ SEARCHES: Final = 20  # of joint zeros
 ANGLES: Final = np.radians([-120, -90, -60, -30, 30, 60, 90, 120, 180, -10, 10]).tolist()
 PARTS: Final = 16  # of the log, between which the camera may have moved
 JUMP: Final = 4.0  # [1] growth of the error between two parts when a camera is moved
+Others = Callable[[], Mapping[str, RobotModel]]
 
 
 class _Remedy(NamedTuple):
@@ -45,13 +46,13 @@ class _Remedy(NamedTuple):
     model: RobotModel
 
 
-def mistakes(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> tuple[str, Identified | None]:
+def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, Identified | None]:
     """Return a line on the mistake of a log with evidence and remedy, empty for none, and else the robot.
 
     Args:
         log: rows.
         model: nominal robot under the sensing of the log.
-        others: nominal models of other arms with as many joints, by name.
+        others: returns the nominal models of other arms with as many joints by name, if the log has a mistake.
     """
     found = log.joint_mistake() or _units(log, model) or _repeats(log)
     if found:
@@ -198,7 +199,7 @@ def _halves(log: Log) -> Iterator[tuple[Log, int]]:
             yield log._replace(valid=np.isin(np.arange(len(log.time)), half)), way
 
 
-def _undone(log: Log, model: RobotModel, others: Mapping[str, RobotModel], known: Mapping[str, float]) -> str:
+def _undone(log: Log, model: RobotModel, others: Others, known: Mapping[str, float]) -> str:
     """Name the one or two mistakes without which the log is explained far better, and others that do so as well.
 
     Where unlikely parameters explain the log, `known`, a mistake leaves likely ones and explains it as well.
@@ -242,14 +243,14 @@ def _placed(remedies: Iterator[_Remedy], rows: FloatArray) -> Iterator[tuple[flo
             yield from zip(errors.tolist(), numbers, group, strict=False)
 
 
-def _pairs(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:
+def _pairs(log: Log, model: RobotModel, others: Others) -> Iterator[_Remedy]:
     """Yield the log without two mistakes each."""
     for k, one in enumerate(_remedies(log, model, others)):
         for other in islice(_remedies(one.log, one.model, others), k + 1, None):
             yield other._replace(text=f"{one.text}, and {other.text}")
 
 
-def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> Iterator[_Remedy]:
+def _remedies(log: Log, model: RobotModel, others: Others) -> Iterator[_Remedy]:
     """Yield the log without one mistake each."""
     q, y, names = log.joints, log.features, log.spec.joint_names
     n = len(names)
@@ -276,5 +277,5 @@ def _remedies(log: Log, model: RobotModel, others: Mapping[str, RobotModel]) -> 
         size = 2.0 * np.median(y, axis=0)
         yield changed("an axis of the image is mirrored", features=(size - y) * (1, 0) + y * (0, 1))
         yield changed("u and v are exchanged", features=y[:, ::-1])
-    for name, other in others.items():
+    for name, other in others().items():
         yield _Remedy(f"the arm is a {name}", log, other)

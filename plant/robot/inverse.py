@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm, plus_diagonal
+from servobench.plant.contract.lanes import norm, plus_diagonal, take
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
 
@@ -48,7 +48,7 @@ def closest_distance(arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike,
     target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
     lead, n = target.shape[:-1], len(low)  # all points have the same starts, within a turn
     drawn = np.random.default_rng(0).uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (STARTS, n))
-    starts = np.broadcast_to(drawn.reshape(STARTS, *(1,) * len(lead), n), (STARTS, *lead, n)).copy()
+    starts = np.broadcast_to(drawn.reshape(STARTS, *(1,) * len(lead), n), (STARTS, *lead, n))
     _, distance = _search(arm, target, starts, (low, high), lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
     return np.asarray(distance.min(axis=0))
 
@@ -77,26 +77,28 @@ def _search(
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions (starts, ..., n) rad near targets (..., 3) m, and their distances from it (starts, ...) m.
 
-    The search begins at `q`, (starts, ..., n) rad, and is over where `find` says so of the distances.
+    The search begins at `q`, (starts, ..., n) rad, and ends for those of which `find` says so of the distances.
     """
+    lead, q, target = arm.translation.ndim - 2, q.copy(), np.broadcast_to(target, (*q.shape[:-1], 3))
     error, J = _error(arm, target, q)
     distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
     for _ in range(ITERATIONS):
-        found = find(distance)
-        if found.all():
+        left = np.nonzero(np.broadcast_to(~find(distance), distance.shape))
+        if not left[0].size:
             break
-        tried = _step(q, error, J, damping, *limits)
-        new_error, new_J = _error(arm, target, tried)
-        nearer = (norm(new_error) < distance) & ~found
-        q = np.where(nearer[..., None], tried, q)
-        error, J = np.where(nearer[..., None], new_error, error), np.where(nearer[..., None, None], new_J, J)
-        distance = norm(error)
-        damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
+        tried = _step(q[left], error[left], J[left], damping[left], *limits)
+        new_error, new_J = _error(take(arm, left[-lead:]) if lead else arm, target[left], tried)
+        new_distance = norm(new_error)
+        nearer = new_distance < distance[left]
+        damping[left] = np.clip(damping[left] * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
+        moved = tuple(each[nearer] for each in left)
+        q[moved], distance[moved] = tried[nearer], new_distance[nearer]
+        error[moved], J[moved] = new_error[nearer], new_J[nearer]
     return q, distance
 
 
 def _error(arm: SerialArm, target: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the error, (starts, ..., 3) m, and the position Jacobian, (starts, ..., 3, n) m/rad."""
+    """Return the error, (..., 3) m, and the position Jacobian, (..., 3, n) m/rad."""
     ball, J = arm.ball_and_jacobian(q)
     return target - ball, np.ascontiguousarray(J)
 
@@ -104,7 +106,7 @@ def _error(arm: SerialArm, target: FloatArray, q: FloatArray) -> tuple[FloatArra
 def _step(
     q: FloatArray, error: FloatArray, J: FloatArray, damping: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """Return the joint positions after a damped step, (starts, ..., n) rad, within the limits."""
+    """Return the joint positions after a damped step, (..., n) rad, within the limits."""
     downhill = np.vecmat(error, J)
     free = ~((q <= lower) & (downhill < 0.0) | (q >= upper) & (downhill > 0.0))
     J = J * free[..., None, :]

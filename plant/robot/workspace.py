@@ -151,17 +151,21 @@ class Clearance:
             singular: allow a Jacobian that is nearly singular.
         """
         q = np.asarray(joint_position, dtype=np.float64)
-        frames = self.arm.frames(q)
-        ball = np.matvec(frames[..., -1, :3, :3], self.arm.tool) + frames[..., -1, :3, 3]
-        placed = self.tubes.placed(frames)
-        fits = ((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1)
-        fits &= (ball[..., 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed) & self._in_view(ball, placed)
-        fits &= (self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1)
-        return np.asarray(fits if singular else fits & (self.gain(q) >= MIN_GAIN * self.scale))
+        fits = np.asarray(((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1))
+        frames = self.arm.frames(q[fits])
+        ball, placed = self.arm.ball(frames), self.tubes.placed(frames)
+        good = (ball[:, 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed)
+        good[good] = self._in_view(ball[good], placed[good])
+        good[good] = (self.gaps(placed[good], self.pairs) >= -OVERLAP * self.scale).all(axis=-1)
+        if not singular:
+            good[good] = self.gain(frames[good]) >= MIN_GAIN * self.scale
+        fits[fits] = good
+        return fits
 
-    def gain(self, joint_position: FloatArray) -> FloatArray:
-        """Return the least singular value of the position Jacobian, (...) m/rad."""
-        return np.asarray(np.linalg.svd(self.arm.ball_jacobian(joint_position), compute_uv=False)[..., -1])
+    def gain(self, frames: FloatArray) -> FloatArray:
+        """Return the least singular value of the position Jacobian, (...) m/rad, for frames (..., n+1, 4, 4)."""
+        motions = self.arm.motions(frames, self.arm.ball(frames)[..., None, :])[..., 0, :, :]
+        return np.asarray(np.linalg.svd(motions.mT, compute_uv=False)[..., -1])
 
     def gaps(self, placed: FloatArray, pairs: npt.NDArray[np.intp]) -> FloatArray:
         """Return the free distance of pairs of tubes, (..., p) m; negative where they overlap."""
@@ -312,7 +316,9 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
-    order = np.argsort(WINDING * norm(fit) - clear.gain(fit) / clear.scale, kind="stable")[:CANDIDATES]
+    order = np.argsort(WINDING * norm(fit) - clear.gain(clear.arm.frames(fit)) / clear.scale, kind="stable")[
+        :CANDIDATES
+    ]
     shares = [_find_box(clear, home)[0] for home in fit[order]]
     return np.asarray(fit[order[int(np.argmax(shares))]])
 
@@ -372,4 +378,4 @@ def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: Fl
     fit = q[clear(q, singular=True)]
     if not len(fit):
         fit = np.vstack([home, postures[clear(postures, singular=True)]])
-    return np.asarray(fit[np.argmin(clear.gain(fit))])
+    return np.asarray(fit[np.argmin(clear.gain(clear.arm.frames(fit)))])

@@ -241,17 +241,9 @@ def exchanged(log):
     return log._replace(joints=log.joints[:, [0, 2, 1, 3, 4, 5]])
 
 
-def reversed_elbow(log):
-    return log._replace(joints=log.joints * np.where(np.arange(6) == ELBOW, -1.0, 1.0))
-
-
 def wrapped(log):
     q = log.joints + (0.0, 0.0, 0.0, 0.0, np.pi - log.joints[60, 4], 0.0)
     return log._replace(joints=(q + np.pi) % (2.0 * np.pi) - np.pi)
-
-
-def mirrored(log):
-    return log._replace(features=log.features * (1.0, -1.0, 1.0))
 
 
 def drifting(log):
@@ -276,8 +268,6 @@ def repeated(log):
 
 MISTAKES = {
     "exchanged": (exchanged, "joints shoulder_lift and elbow are exchanged"),
-    "reversed": (reversed_elbow, "the direction of joint elbow is reversed"),
-    "mirrored": (mirrored, "an axis of the camera is mirrored, or two are exchanged"),
     "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the begin"),
     "early": (
         early,
@@ -297,15 +287,14 @@ MISTAKES = {
 def test_a_mistake_is_named_with_its_remedy(mistake):
     change, wanted = MISTAKES[mistake]
     log, _, model = logged()
-    text, robot = mistakes(change(log), model, {})
+    text, robot = mistakes(change(log), model)
     assert re.search(wanted, text)
     assert robot is None
 
 
-def test_another_arm_is_named():
-    log, _, _ = logged()
-    ur5e, ur10e = (find_robot(name).nominal for name in ("ur5e", "ur10e"))
-    assert "the arm is a ur10e" in mistakes(log, ur5e, {"ur10e": ur10e})[0]
+def test_another_arm_is_named(output_of, tmp_path):
+    logged()[1].to_csv(tmp_path / "robot.csv", index=False)
+    assert ": the arm is a ur10e" in output_of("identify", tmp_path / "robot.csv", "--robot", "ur5e", code=1)
 
 
 def test_outliers_and_a_joint_at_rest_are_no_mistakes():
@@ -313,7 +302,7 @@ def test_outliers_and_a_joint_at_rest_are_no_mistakes():
     rng, y = np.random.default_rng(2), log.features.copy()
     bad = rng.random(len(y)) < 0.3
     y[bad] += rng.normal(0.0, 0.3, (int(bad.sum()), 3))
-    text, robot = mistakes(log._replace(features=y), model, {})
+    text, robot = mistakes(log._replace(features=y), model)
     assert text == ""
     assert 1.0 - robot.inliers.mean() == pytest.approx(0.3, abs=0.05)
     assert np.sqrt(np.diag(robot.noise)).max() < 0.0015
@@ -418,15 +407,15 @@ def test_a_twin_has_the_rate_and_the_latency_of_a_camera_that_is_no_multiple_of_
 
 
 @pytest.mark.slow
-def test_two_mistakes_are_named_together_and_more_of_them_refused():
+def test_two_mistakes_are_named_together_and_a_log_that_they_do_not_explain_is_refused():
     log, _, model = logged()
     order = np.argsort(np.argsort(log.spec.joint_names))
     both = log._replace(joints=log.joints[:, order], features=log.features * (1, 1, -1))
-    text, robot = mistakes(both, model, {})
+    text, robot = mistakes(both, model)
     assert text.startswith("joints are in alphabetical order, as in ROS, and an axis of the camera is mirrored")
     assert robot is None
-    three = both._replace(joints=both.joints * (1, 1, 1, -1, 1, 1) + (0, 0, np.pi / 2, 0, 0, 0))
-    text, robot = mistakes(three, model, {})
+    foreign = 0.2 * np.sin(log.time[:, None] * (9.0, 7.0, 5.0))
+    text, robot = mistakes(log._replace(features=foreign, valid=log.time < 5.2), model)  # has no halves of 50 frames
     assert "of the motion, and neither one mistake nor two explain them" in text
     assert robot is None
 
@@ -435,7 +424,7 @@ def test_two_mistakes_are_named_together_and_more_of_them_refused():
 def test_a_mistake_is_named_although_the_camera_was_moved_too():
     log, _, model = logged()
     moved = log.features + 0.05 * (log.time[:, None] > 0.5 * log.time[-1]) * (1, 0, 0)
-    text, robot = mistakes(log._replace(joints=log.joints * (1, 1, -1, 1, 1, 1), features=moved), model, {})
+    text, robot = mistakes(log._replace(joints=log.joints * (1, 1, -1, 1, 1, 1), features=moved), model)
     assert text.startswith(f"the direction of joint {log.spec.joint_names[2]} is reversed (undone, ")
     assert robot is None
 
@@ -443,11 +432,9 @@ def test_a_mistake_is_named_although_the_camera_was_moved_too():
 @pytest.mark.slow
 def test_frames_late_by_changing_times_are_no_clocks_that_drift():
     settings = {"random": {"duration": 60.0}, "run": {"lost_after": 20.0}, "Excite": {"swing": 0.25, "fastest": 0.5}}
-    nominal, lines = find_robot("ur5").nominal, []
-    for seed in (173400, 173401):  # their drifts are 5.7 and 6.5 deviations of a steady latency
-        made = run("docs/examples/excite.py", task="random", mismatch="jitter=200ms", seed=seed, settings=settings)
-        lines.append(mistakes(read_log(logged()[0].spec, made.steps), nominal, {})[0])
-    assert lines == [""] * len(lines)
+    made = run("docs/examples/excite.py", task="random", mismatch="jitter=200ms", seed=173401, settings=settings)
+    log = read_log(logged()[0].spec, made.steps)
+    assert mistakes(log, find_robot("ur5").nominal)[0] == ""  # a drift of 6.5 deviations of a steady latency
 
 
 def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
@@ -456,7 +443,7 @@ def test_zeros_at_any_angle_are_parameters_and_no_mistakes():
     made = run("docs/examples/excite.py", task="random", mismatch=words, seed=81000, settings=settings)
     request = RunRequest("kinematic", "constant", "random", read_mismatch(words), 81000)
     model = find_robot("ur5").nominal
-    text, robot = mistakes(read_log(logged()[0].spec, made.steps), model, {})
+    text, robot = mistakes(read_log(logged()[0].spec, made.steps), model)
     wanted = draw_robot(request)[0].arm.joint_offset - model.arm.joint_offset
     assert text == ""
     assert robot.estimate("zero_elbow")[0] == pytest.approx(wanted[ELBOW], abs=0.05)
