@@ -226,11 +226,10 @@ def test_an_unlikely_dh_table_is_remarked_on(tmp_path, caplog):
 def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
     pytest.importorskip("yourdfpy")
     cases = [
-        (' velocity="2"', "", "limits that the URDF lacks are taken as ±2π rad and π rad/s: velocity of joint_1,"),
         (
-            'lower="-2.5" ',
-            "",
-            "limits that the URDF lacks are taken as ±2π rad and π rad/s: range of joint_1, range of",
+            'lower="-2.5" upper="2.5" effort="50" velocity="2"',
+            'upper="2.5"',
+            "limits that the URDF lacks are taken as ±2π rad and π rad/s: range of joint_1, velocity of joint_1, range",
         ),
         ('rpy="0.1', 'rpy="90', "has an rpy of 90, and angles of a URDF are in rad"),
         (
@@ -247,14 +246,18 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
     assert_remarks(caplog, partial(robot_of, tmp_path, "arm.urdf"), HEAVY, cases)
 
 
-@pytest.mark.parametrize("yy", [0.02, 0.02001, 0.04])
-def test_a_body_of_a_urdf_has_the_nearest_possible_inertia(tmp_path, yy):
+def test_a_body_of_a_urdf_has_the_nearest_possible_inertia(tmp_path):
     """Least squares: both small moments grow by a third of what they lack together, and the largest shrinks as much."""
     pytest.importorskip("yourdfpy")
-    robot = robot_of(tmp_path, "arm.urdf", HEAVY.replace('iyy="0.01"', f'iyy="{yy}"'))
-    moments, third = np.linalg.eigvalsh(robot.links.inertia[0]), (yy - 0.02) / 3.0
-    np.testing.assert_allclose(moments, (0.01 + third, 0.01 + third, yy - third), rtol=2e-6)
-    assert moments[0] + moments[1] > moments[2]
+    cases, content = {1: 0.02, 3: 0.04}, HEAVY  # link -> moment
+    for link, yy in cases.items():
+        changed = INERTIAL.replace('iyy="0.01"', f'iyy="{yy}"')
+        content = content.replace(f'"link_{link}">{INERTIAL}', f'"link_{link}">{changed}')
+    inertia = robot_of(tmp_path, "arm.urdf", content).links.inertia
+    for link, yy in cases.items():
+        moments, third = np.linalg.eigvalsh(inertia[link - 1]), (yy - 0.02) / 3.0
+        np.testing.assert_allclose(moments, (0.01 + third, 0.01 + third, yy - third), rtol=2e-6)
+        assert moments[0] + moments[1] > moments[2]
 
 
 ODD = odd_urdf()
