@@ -194,10 +194,7 @@ def identify(
     experiment.plant.close()
     apart = [name for name in ROBOTS if name != request.robot]  # made only for a log with a mistake
     with console.status(f"identifying {request.robot} in {len(table)} rows"):
-        mistake, found = mistakes(
-            rows, setup.nominal(own),
-            lambda: {name: setup.nominal(arm) for name in apart if (arm := find_robot(name)).n == own.n},
-        )  # fmt: skip
+        mistake, found = mistakes(rows, setup.nominal(own), lambda: {k: setup.nominal(find_robot(k)) for k in apart})
         response = command_response(rows)
     if found is None:
         say(f"{log}: {mistake}")

@@ -191,16 +191,6 @@ def prior(name: str) -> float:
     return PRIORS[kind_of(name)]
 
 
-class _State(NamedTuple):
-    """What the features are computed from."""
-
-    values: dict[str, float]  # θ by name
-    time: FloatArray  # (k,) [s] at which the frames were exposed
-    joints: FloatArray  # (k, n) [rad] behind their gears then
-    model: RobotModel  # at θ
-    frames: FloatArray  # (k, n+1, 4, 4) of its arm
-
-
 class _Problem:
     """Residuals of the valid frames of a log as a function of z = θ / s."""
 
@@ -216,7 +206,7 @@ class _Problem:
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model, self.pace, model = model, 1.0, deviated(model, begin)
-        self._kept: tuple[tuple[bytes, float], _State] | None = None
+        self._last: Any = None  # z, pace and model of the last errors
         latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
         self.spread, latency, turning, pose = self._placed(model, latencies, np.zeros_like(latencies))
         if not pixels:
@@ -239,15 +229,6 @@ class _Problem:
         """Return θ by name."""
         return dict(zip(self.names, (self.scale * z).tolist(), strict=True))
 
-    def _at(self, z: FloatArray) -> _State:
-        """Return the state at z, which is kept, as the derivatives are wanted where the errors were."""
-        key = (z.tobytes(), self.pace)
-        if self._kept is None or self._kept[0] != key:
-            values = self.values(z)
-            (time, q), model = self._exposed(values), deviated(self.model, values)
-            self._kept = key, _State(values, time, q, model, model.arm.frames(q))
-        return self._kept[1]
-
     def _exposed(self, values: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Return when the frames were exposed, (..., k) s, and the joints behind their gears then, (..., k, n) rad."""
         steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
@@ -269,12 +250,17 @@ class _Problem:
 
     def errors(self, z: FloatArray) -> FloatArray:
         """Return y − h, (k, m)."""
-        values, time, _, model, frames = self._at(z)
+        values = self.values(z)
+        (time, q), model = self._exposed(values), deviated(self.model, values)
+        frames = model.arm.frames(q)
+        self._last, self._kept = (z.tobytes(), self.pace, self.model), (values, time, q, model, frames)
         return np.asarray(self.y - self._seen(model, values, time, model.arm.ball(frames)))
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Return ∂(y − h)/∂z, (p, k, m): of arm and camera by the chain rule, of others by differences."""
-        values, time, q, model, frames = self._at(z)
+        if self._last != (z.tobytes(), self.pace, self.model):
+            self.errors(z)
+        values, time, q, model, frames = self._kept
         ball, motions = ball_rates(self.model, model.arm, q, frames)
         by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
         seen = self._seen(model, values, time, ball)
@@ -312,7 +298,6 @@ class _Problem:
     def recentred(self, z: FloatArray) -> FloatArray:
         """Take the pose of the camera for that from which it deviates, and return the z that is left."""
         self.model, values = self.model.with_camera(self.pose(z)), self.values(z)
-        self._kept = None
         size = max(abs(values["backlash"]), MIN_PLAY)
         gears = transmitted(self.log.joints, values["ripple"], RIPPLE_ORDER)
         self.play = CubicSpline(self.log.time, played(gears, size) / size)
@@ -347,8 +332,7 @@ class _Problem:
 
 def turned(places: FloatArray, angle: FloatArray) -> FloatArray:
     """Return places (..., k, 3) as cameras see them that are turned about the optical axis by angles (..., k) [rad]."""
-    x, y, z = np.moveaxis(places, -1, 0)
-    c, s = np.cos(angle), np.sin(angle)
+    (x, y, z), c, s = np.moveaxis(places, -1, 0), np.cos(angle), np.sin(angle)
     return np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1)
 
 

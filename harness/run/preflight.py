@@ -52,7 +52,7 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
     Args:
         log: rows.
         model: nominal robot under the sensing of the log.
-        others: returns the nominal models of other arms with as many joints by name, if the log has a mistake.
+        others: returns the nominal models of other arms by name; called for a log with a mistake.
     """
     found = log.joint_mistake() or _units(log, model) or _repeats(log)
     if found:
@@ -278,4 +278,5 @@ def _remedies(log: Log, model: RobotModel, others: Others) -> Iterator[_Remedy]:
         yield changed("an axis of the image is mirrored", features=(size - y) * (1, 0) + y * (0, 1))
         yield changed("u and v are exchanged", features=y[:, ::-1])
     for name, other in others().items():
-        yield _Remedy(f"the arm is a {name}", log, other)
+        if other.arm.n == n:
+            yield _Remedy(f"the arm is a {name}", log, other)

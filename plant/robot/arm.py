@@ -117,12 +117,8 @@ class SerialArm:
         """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""
         return self.ball(self.frames(joint_position))
 
-    def ball_jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return ∂(ball centre)/∂(reported joint position), (..., 3, n) m/rad, for (..., n) in rad."""
-        return self.ball_and_jacobian(joint_position)[1]
-
     def ball_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `ball_position` and `ball_jacobian` at the cost of one forward kinematics."""
+        """Return the ball centre, (..., 3) m, and its derivative by the reported (..., n) rad, (..., 3, n) m/rad."""
         frames = self.frames(joint_position)
         ball = self.ball(frames)
         return ball, np.swapaxes(self.motions(frames, ball[..., None, :])[..., 0, :, :], -1, -2)

@@ -12,7 +12,7 @@ along its axis to the tube's side, along the tube, and to the next joint, as the
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -267,9 +267,9 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
     if arm.n < 3 or length_scale(arm) == 0.0:
         size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
         raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
-    found = [_at_height(arm, limits, shapes, height) for height in HEIGHTS[:1]]
+    found = [_at_height(arm, limits, shapes, HEIGHTS[0])]
     for height in HEIGHTS[1:]:
-        if found[-1] is None or found[-1].share < ENOUGH * 0.8:
+        if found[-1] is None or found[-1][0] < ENOUGH * 0.8:
             found.append(_at_height(arm, limits, shapes, height))
     fit = [each for each in found if each is not None]
     if not fit:
@@ -284,31 +284,13 @@ def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
             look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
         wanted = "in which its ball is over the table, in view of the camera and free of contact"
         raise ValueError(f"the arm has no posture {wanted}; look at {look}")
-    return max(fit, key=lambda each: each.share).workspace()
+    return max(fit, key=lambda each: each[0])[1]()
 
 
-class _Bench(NamedTuple):
-    """A bench around an arm at a height, with a home in a box of postures."""
-
-    clear: Clearance
-    centre: FloatArray  # (3,) [m]
-    lift: FloatArray  # (3,) [m]
-    postures: FloatArray  # (s, n) [rad] that are drawn at random
-    home: FloatArray  # (n,) [rad]
-    share: float  # of fit postures in the box
-    box: Pair
-
-    def workspace(self) -> Workspace:
-        """Return the workspace with its moves."""
-        clear, home, arm, scale = self.clear, self.home, self.clear.arm, self.clear.scale
-        moves = {name: _move(clear, home, *(scale * (np.array(ends) + self.lift))) for name, ends in MOVES.items()}
-        stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), self.postures)
-        shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
-        return Workspace(scale, self.centre, shoulder, home, *self.box, moves, stretched, clear)
-
-
-def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> _Bench | None:
-    """Return the bench at a height; None where no home is found."""
+def _at_height(
+    arm: SerialArm, limits: Pair, shapes: Pair, height: float
+) -> tuple[float, Callable[[], Workspace]] | None:
+    """Return the fit share of the box at a height and what makes its workspace; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
     centre = scale * (np.array(CENTRE) + lift)
@@ -319,7 +301,17 @@ def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> _Be
     postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
     clear = replace(clear, pairs=collision_pairs(clear, postures))
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
-    return None if home is None else _Bench(clear, centre, lift, postures, home, *_find_box(clear, home))
+    if home is None:
+        return None
+    share, box = _find_box(clear, home)
+
+    def workspace() -> Workspace:
+        moves = {name: _move(clear, home, *(scale * (np.array(ends) + lift))) for name, ends in MOVES.items()}
+        stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), postures)
+        shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
+        return Workspace(scale, centre, shoulder, home, *box, moves, stretched, clear)
+
+    return share, workspace
 
 
 def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> FloatArray | None:

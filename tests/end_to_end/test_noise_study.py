@@ -58,10 +58,10 @@ def test_tables_are_of_ratios_to_the_true_jacobian_of_the_same_run(monkeypatch, 
 
 def test_the_picture_has_a_column_for_each_measure(monkeypatch, tmp_path):
     monkeypatch.setattr(noise, "load_runs", made_up)
-    ((name, content),) = pictures(POSITION, tmp_path).items()
+    with mpl.rc_context({"savefig.facecolor": "black"}):  # of the user's
+        ((name, content),) = pictures(POSITION, tmp_path).items()
     assert name == "pictures/noise.png"
     assert len(content) < 300e3
     with Image.open(io.BytesIO(content)) as picture:
         assert picture.size[0] > 900
-    with mpl.rc_context({"savefig.facecolor": "black"}):  # of the user's
-        assert pictures(POSITION, tmp_path)[name] == content
+        assert picture.convert("RGB").getpixel((0, 0)) == (255, 255, 255)

@@ -18,7 +18,9 @@ def oracle(arm: SerialArm, point: np.ndarray, lower: np.ndarray, upper: np.ndarr
     """The distance that scipy's trust-region search within bounds finds, from four other starts."""
     draws = np.random.default_rng(7).uniform(np.maximum(lower, -3.0), np.minimum(upper, 3.0), (4, 6))
     found = (
-        least_squares(lambda q: arm.ball_position(q) - point, start, arm.ball_jacobian, bounds=(lower, upper))
+        least_squares(
+            lambda q: arm.ball_position(q) - point, start, lambda q: arm.ball_and_jacobian(q)[1], bounds=(lower, upper)
+        )
         for start in draws
     )
     return min(float(np.linalg.norm(one.fun)) for one in found)
