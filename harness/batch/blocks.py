@@ -23,7 +23,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
-from functools import lru_cache
 from io import BytesIO
 from itertools import groupby, islice
 from pathlib import Path
@@ -32,14 +31,11 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
-import pyarrow as pa
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
-from servobench.harness.batch.tables import MAX_TIME, MOST, TEXTS, lacking, unfit_names
 from servobench.harness.config.registry import (
     Offer,
     find_controller,
@@ -313,6 +309,8 @@ def unpack_result(job: Job, told: object) -> RunResult:
     Raises:
         ValueError: it is not the result of this run.
     """
+    from servobench.harness.batch import tables  # noqa: PLC0415 - pandas and pyarrow, which workers do without
+
     match told:
         case {
             "row": dict(row), "steps": str() | None as steps, "picture": str() | None as picture, "trace": str(trace)
@@ -326,47 +324,19 @@ def unpack_result(job: Job, told: object) -> RunResult:
     own = (identity.keys() | job.cell.columns.keys()) - {"robot", "engine"}
     if len({json.dumps([each[name] for name in own]) for each in (known, row)}) > 1:  # NaN is NaN, but 1 not 1.0
         raise ValueError("it is that of another run")
-    for name, wanted in _unfit_kinds(tuple((name, type(row[name]), type(known.get(name))) for name in row)):
+    for name, wanted in tables.unfit_kinds(tuple((name, type(row[name]), type(known.get(name))) for name in row)):
         raise ValueError(f"its {name} is {str(row[name])[:60]!r}, wanted a value of type {wanted}")
-    for name, most in MOST.items():
+    for name, most in tables.MOST.items():
         if (value := row.get(name)) is not None and (value < 0 or value > most):
             raise ValueError(f"its {name} is {value:g}")
-    if wrong := unfit_names(tuple(row)):
+    if wrong := tables.unfit_names(tuple(row)):
         raise ValueError(f"it {wrong}")
     image = _unpack_array(picture)
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
-    return RunResult(row, _unpack_steps(steps, row[RUN_ID]), image, trace)
-
-
-@lru_cache(8)  # the rows of a batch have the same ones
-def _unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, str]]:
-    """Return the columns with a value of a wrong type, each with the name of the right one.
-
-    Args:
-        kinds: name, type of the value and type of the known value of each column.
-    """
-    unfit = []
-    for name, kind, known in kinds:
-        usual = str if name in TEXTS else float
-        wanted = (usual, type(None)) if known is type(None) else (known,)
-        if not issubclass(kind, wanted):
-            unfit.append((name, wanted[0].__name__))
-    return unfit
-
-
-def _unpack_steps(text: str | None, run_id: str) -> pd.DataFrame | None:
-    if (records := _unpack_array(text)) is None:
-        return None
-    if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
-        raise ValueError("its steps are no numbers")
-    table = pd.DataFrame.from_records(records)
-    table.insert(0, RUN_ID, run_id)
-    if wrong := unfit_names(tuple(table.columns)) or lacking("steps", pa.Schema.from_pandas(table)):
-        raise ValueError(f"its table of steps {wrong}")
-    if not table["time_s"].between(0.0, MAX_TIME).all():
-        raise ValueError("its steps have no times")
-    return table
+    records = _unpack_array(steps)
+    table = None if records is None else tables.steps_of_run(records, row[RUN_ID])
+    return RunResult(row, table, image, trace)
 
 
 def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
@@ -411,6 +381,7 @@ def open_workers(
     controllers: Collection[str] = (),
     own: Sequence[Offer] = (),
     trusted: Collection[str] = (),
+    steps: bool = False,
 ) -> Iterator[Workers]:
     """Yield workers; their processes start with the first task and end with the context.
 
@@ -425,6 +396,7 @@ def open_workers(
         controllers: names of the controllers.
         own: controllers and plants that users gave.
         trusted: names of FMUs that may share a process with the code of this package.
+        steps: whether runs return their tables of steps, for which workers import pandas once.
 
     Raises:
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, a limit is asked
@@ -449,7 +421,7 @@ def open_workers(
     if count == 1 and limits == Limits():
         yield Workers()
         return
-    pool = Pool(count, limits, (*MODULES, *own_modules(plants, controllers)))
+    pool = Pool(count, limits, (*MODULES, *["pandas"] * steps, *own_modules(plants, controllers)))
     try:
         yield Workers(pool.submit, count)
     finally:

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
+import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
 import pyarrow.dataset as ds
@@ -236,6 +237,39 @@ def lacking(kind: str, schema: pa.Schema) -> str:
             wanted = "texts" if text else "whole numbers" if name in WHOLE else "numbers"
             return f"has {given} in the column {name}, where {wanted} belong"
     return ""
+
+
+@lru_cache(8)  # the rows of a batch have the same ones
+def unfit_kinds(kinds: tuple[tuple[str, type, type], ...]) -> list[tuple[str, str]]:
+    """Return the columns with a value of a wrong type, each with the name of the right one.
+
+    Args:
+        kinds: name, type of the value and type of the known value of each column.
+    """
+    unfit = []
+    for name, kind, known in kinds:
+        usual = str if name in TEXTS else float
+        wanted = (usual, type(None)) if known is type(None) else (known,)
+        if not issubclass(kind, wanted):
+            unfit.append((name, wanted[0].__name__))
+    return unfit
+
+
+def steps_of_run(records: npt.NDArray[Any], run_id: str) -> pd.DataFrame:
+    """Return the table of steps of a run from the records that another process has sent.
+
+    Raises:
+        ValueError: they are no steps.
+    """
+    if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
+        raise ValueError("its steps are no numbers")
+    table = pd.DataFrame.from_records(records)
+    table.insert(0, "run_id", run_id)
+    if wrong := unfit_names(tuple(table.columns)) or lacking("steps", pa.Schema.from_pandas(table)):
+        raise ValueError(f"its table of steps {wrong}")
+    if not table["time_s"].between(0.0, MAX_TIME).all():
+        raise ValueError("its steps have no times")
+    return table
 
 
 def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:

@@ -118,14 +118,14 @@ def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
 
 def _shares(rows: pd.DataFrame, least: dict[str, int], whole: dict[str, int], room: int) -> dict[str, int]:
     """Return the widths of columns in one table: the widest give way first, and those of most lines get the rest."""
-    names = list(rows.columns)
+    names, cells = list(rows.columns), {name: (name, *rows[name]) for name in rows.columns}
     widths = {name: whole[name] for name in names}
     for most in range(max(widths.values()), 0, -1):
         if sum(widths.values()) + GAP * len(names) <= room:
             break
         widths = {name: max(least[name], min(whole[name], most)) for name in names}
     for _ in range(room - sum(widths.values()) - GAP * len(names)):
-        lines = {name: max(len(wrap(cell, widths[name])) for cell in (name, *rows[name])) for name in names}
+        lines = {name: max(len(wrap(cell, widths[name])) for cell in cells[name]) for name in names}
         highest = max(names, key=lambda name: lines[name] * (widths[name] < whole[name]))
         widths[highest] += widths[highest] < whole[highest]
     return widths

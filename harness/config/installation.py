@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,6 +67,7 @@ CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes chan
 COMMIT_DIGITS = 12  # that a reader is shown
 
 
+@cache  # to read it takes milliseconds, and a manifest has eleven
 def installed_version(name: str = "servobench") -> str | None:
     """Return the version of a distribution; None where it is not installed."""
     try:
@@ -74,6 +76,7 @@ def installed_version(name: str = "servobench") -> str | None:
         return None
 
 
+@cache
 def git_commit() -> str | None:
     """Return the commit of the checkout this code lies in, marked where code differs from it; None outside one."""
     root = Path(__file__).resolve().parents[2]

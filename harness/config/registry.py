@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final, Generic, TypeAlias
 
@@ -133,7 +133,7 @@ class Registry(Generic[Entry]):
     def unused_points(self) -> list[tuple[str, str]]:
         """Return the names of entry points that are not used, each with a line that says why: others have the name."""
         found = dict[tuple[str, str], str]()
-        for point in _published(self.group):
+        for point in _published().select(group=self.group):
             used = _points(self.group).get(point.name)
             if point.name in self.own:
                 why = f"servobench has a {self.kind.word} of this name, which cannot be taken over"
@@ -148,17 +148,14 @@ class Registry(Generic[Entry]):
         return [(name, line) for (name, _), line in found.items()]
 
 
-@cache
-def _published(group: str) -> EntryPoints:
-    """Return the entry points of a group; to find them takes a file of each installed distribution."""
-    return entry_points(group=group)
+_published: Final = cache(entry_points)  # of all groups: to find them takes a file of each installed distribution
 
 
 @cache
 def _points(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of a group that have a name of their own, the first one of each name."""
     points: dict[str, EntryPoint] = {}
-    for point in _published(group):
+    for point in _published().select(group=group):
         if point.name not in (RUN, ALL):
             points.setdefault(point.name, point)
     return points
