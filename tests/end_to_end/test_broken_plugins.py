@@ -97,7 +97,7 @@ CONTROLLERS = {
     "circle": "a task is called 'circle', too; give the controller another name",
 }
 REMEDY = "raise an error instead, so that the other runs go on"
-WAITS = "no answer after 4 s; is there a loop without an end, or something that waits?"
+WAITS = "no answer after 3 s; is there a loop without an end, or something that waits?"
 HARMFUL = {  # what only a process of its own survives
     "hang": f"controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:46: {WAITS}",
     "ends": f"controller 'ends' (some_law:Ends) cannot be used: it ended the process with exit code 3; {REMEDY}",
@@ -127,7 +127,7 @@ from servobench.harness.batch import trials
 from servobench.harness.cli.main import main
 from servobench.harness.config import registry
 
-trials.TRIAL_LIMIT = trials.IMPORT_LIMIT = 4.0
+trials.TRIAL_LIMIT = trials.IMPORT_LIMIT = 3.0
 own = registry.CONTROLLER_REGISTRY.own
 for name in set(own) - {"ukf_mfac", "constant", "nmpc_calibrated"}:
     del own[name]

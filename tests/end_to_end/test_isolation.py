@@ -101,16 +101,14 @@ def test_the_undisturbed_run_is_that_of_a_quiet_sweep(swept, tmp_path, monkeypat
     pd.testing.assert_frame_equal(judged(ours), judged(results.load_runs(out)), check_exact=True)
 
 
-def test_a_single_run_ends_with_its_row(tmp_path):
+def test_a_single_run_ends_with_its_row(output_of, tmp_path):
     out = tmp_path / "out"
     single = ("run", places("Segfaults"), "--plant", "kinematic", "--no-figures", "--set", "exp2.duration=0.5")
-    code, output = finish(start(*single, "--out", str(out)))
-    assert code == 1, output
-    assert "1 of 1 run failed" in output
+    assert "1 of 1 run failed" in output_of(*single, "--out", out, code=1)
     assert results.load_runs(out)["status"].tolist() == ["crashed"]
 
 
-def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(tmp_path):
+def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_that_hangs(tmp_path, monkeypatch):
     out, mark = tmp_path / "out", "resumed"
     names = places("Quiet", "HangsWithChildren")
     arguments = ("sweep", "--controllers", names, "--workers", "1", *SHORT, "--run-timeout", "3", "--out", str(out))
@@ -119,8 +117,7 @@ def test_nothing_outlives_a_batch_that_is_killed_and_resumed_it_goes_past_a_run_
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     assert_nothing_stays(mark)
-    code, output = finish(start(*arguments, "--resume"))
-    assert code == 0, output
+    assert servobench(monkeypatch, *arguments, "--resume") == 0
     assert results.load_runs(out)["status"].tolist() == ["completed", "timed_out"]
 
 

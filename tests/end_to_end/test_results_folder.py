@@ -97,9 +97,9 @@ def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed
 @linux
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 @pytest.mark.parametrize("arguments", [
-    ("--runs", "12", "--controllers", "constant", "--block", "4", "--every", "29"),
-    ("--steps", "--runs", "4", "--every", "40"),
-    ("--caches", "--every", "23"),
+    ("--runs", "12", "--controllers", "constant", "--block", "4", "--every", "45"),
+    ("--steps", "--runs", "4", "--every", "65"),
+    ("--caches", "--every", "31"),
 ])  # fmt: skip
 def test_a_batch_and_caches_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(tmp_path, arguments):
     figures = file_faults.start(tmp_path, *arguments, timeout=550)

@@ -11,7 +11,7 @@ from servobench.harness.studies.tuning import campaign as tuning_check
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 
-SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]
+SHORT = ["--controllers", "rls", "--robots", "1", "--studies", "1", "--search", "0", "--workers", "1"]
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ def test_code_of_users_has_no_search_space_and_is_not_imported(refusal_of, tmp_p
 def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(output_of, monkeypatch, tmp_path):
     out = tmp_path / "out"
     told = " ".join(output_of("tune", *SHORT, "--trials", "1", "--out", out).split())
-    assert "at most 1 method × 1 studies × 1 points × 16 runs = 16 runs; --controllers, --studies, --trials" in told
+    assert "at most 1 method × 1 studies × 1 points × 8 runs = 8 runs; --controllers, --studies, --trials" in told
     first = read_tuned(out / "rls.toml")
     assert first.settings == nested_settings(default_values(find_tunable("rls")))
     assert first.score == first.score_of_defaults
@@ -42,7 +42,7 @@ def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(output_of
 
 
 def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whether(output_of, monkeypatch, tmp_path):
-    check = ("tune", "--check", "--controllers", "constant", "--robots", "2", "--workers", "1")
+    check = ("tune", "--check", "--controllers", "constant", "--robots", "1", "--workers", "1")
     for tolerance in (10.0, -10.0):
         monkeypatch.setattr(tuning_check, "TOLERANCE", tolerance)
         output = output_of(*check, "--out", tmp_path / "out", code=0 if tolerance > 0.0 else 1)
@@ -78,7 +78,7 @@ def test_a_plant_of_the_user_is_tuned_on_and_another_version_of_it_refused(outpu
 
 def test_ctrl_c_keeps_the_study(tmp_path):
     out = tmp_path / "out"
-    arguments = ("tune", "--controllers", "constant", "--robots", "2", "--workers", "2", "--trials", "500")
+    arguments = ("tune", "--controllers", "constant", "--robots", "1", "--workers", "2", "--trials", "500")
     process, ledger = start(*arguments, "--out", str(out)), out / "constant.jsonl"
     wait_for(lambda: ledger.exists() and ledger.read_text().count('"costs"') >= 2)
     os.killpg(process.pid, signal.SIGINT)
