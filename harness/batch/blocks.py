@@ -55,6 +55,7 @@ from servobench.plant.contract.settings import REMARKS, remark
 
 BLOCK: Final = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
 RUN_ID: Final = "run_id"
+TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
 
 
@@ -129,9 +130,9 @@ def carry_out_blocks(
         return
     waiting, again = iter(blocks), deque[Block]()
     finished: SimpleQueue[tuple[Block, Any]] = SimpleQueue()
-    under_way = 0
+    under_way, most = 0, TASKS_PER_WORKER * workers.count
     while True:
-        while under_way < workers.window and (given := again.popleft() if again else next(waiting, None)):
+        while under_way < most and (given := again.popleft() if again else next(waiting, None)):
             future = workers.submit(_task(_carry_out_there, given, steps, keep))
             future.add_done_callback(lambda done, block=given: finished.put((block, done)))
             under_way += 1
@@ -259,8 +260,7 @@ def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool,
             f"a worker process lacks a class: {error}; define it above `if __name__ == '__main__':`, as workers import "
             "the file without the lines below, or compare with workers=1 and without limits"
         ) from error
-    block, *_ = unpacked
-    request = block.jobs[0].cell.request
+    block, request = unpacked[0], unpacked[0].jobs[0].cell.request
     with offering(block.own), contextlib.suppress(BaseException):
         find_plant(request.plant)
         find_controller(request.controller)
@@ -335,8 +335,7 @@ def unpack_result(job: Job, told: object) -> RunResult:
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
     records = _unpack_array(steps)
-    table = None if records is None else tables.steps_of_run(records, row[RUN_ID])
-    return RunResult(row, table, image, trace)
+    return RunResult(row, None if records is None else tables.steps_of_run(records, row[RUN_ID]), image, trace)
 
 
 def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
@@ -358,7 +357,7 @@ def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
-MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
+MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks", "numpy.ma")  # imported once
 ONE_TASK: Final = threading.Lock()  # held by the one task that a process of an executor carries out at a time
 
 

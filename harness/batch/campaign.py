@@ -144,11 +144,10 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         raise ConfigurationError(f"a batch of {runs.count} runs has at most {runs.count} parts, got {how.part[1]}")
     own = offered(runs.sections)
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
+    names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
-    with open_workers(
-        how.workers, how.scheduler, bounds, plants=runs.plants, controllers=runs.controllers, own=own, trusted=trusted,
-        steps=campaign.steps,
-    ) as place:  # fmt: skip
+    opening = open_workers(how.workers, how.scheduler, bounds, **names, own=own, trusted=trusted, steps=campaign.steps)
+    with opening as place:
         _carry_out_at(place, campaign, runs, own, folder, how)
 
 

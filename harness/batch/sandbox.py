@@ -45,7 +45,6 @@ GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is 
 START_ERROR: Final = 1  # exit code of a guard that an error has kept from starting
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
-TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
 MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
 KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
@@ -92,11 +91,6 @@ class Workers:
     count: int = 1  # number of tasks that are carried out at a time
     cluster: bool = False  # whether runs happen on other machines
     lost: tuple[type[BaseException], ...] = ()  # errors of a future whose process died
-
-    @property
-    def window(self) -> int:
-        """How many tasks are handed out at a time."""
-        return TASKS_PER_WORKER * self.count
 
 
 def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell) -> Ending | None:

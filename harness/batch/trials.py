@@ -74,8 +74,7 @@ def attempt(
     Raises:
         ConfigurationError: that of the function.
     """
-    from servobench.harness.batch.processes import Bounds  # noqa: PLC0415 - lists of what is our own need no sandbox
-    from servobench.harness.batch.sandbox import call  # noqa: PLC0415 - as above
+    from servobench.harness.batch import processes, sandbox  # noqa: PLC0415 - lists of what is our own need none
 
     found: dict[str, Any] = {}
 
@@ -86,8 +85,8 @@ def attempt(
             case ["answer" | "refusal" | "failure" as part, value]:
                 found[part] = value
 
-    limits = Bounds(limit).limits(1, foreign=True)
-    end = call(_attempt_here, (function, arguments, quiet, hear is not None), limits, receive)
+    limits = processes.Bounds(limit).limits(1, foreign=True)
+    end = sandbox.call(_attempt_here, (function, arguments, quiet, hear is not None), limits, receive)
     if "refusal" in found:
         raise ConfigurationError(str(found["refusal"]))
     return found.get("answer"), str(found.get("failure", "")) if end is None else why(end, limit)

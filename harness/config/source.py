@@ -170,8 +170,8 @@ def is_users(file: str) -> bool:
 @cache
 def _plugin_packages() -> frozenset[str]:
     """Return the top-level packages of other distributions that publish something for this package."""
-    groups = (group for group in entry_points().groups if group.startswith(f"{PACKAGE}."))
-    points = (point for group in groups for point in entry_points(group=group))
+    found = entry_points()
+    points = (each for group in found.groups if group.startswith(f"{PACKAGE}.") for each in found.select(group=group))
     return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
 
 

@@ -82,9 +82,8 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     if runs.empty:
         raise ConfigurationError(f"{folder} holds no finished run")
     target = path or folder / NAME
-    page = _page(folder, runs)
     with accessing(target, "report"):
-        write_atomically(target, lambda file: file.write_text(page, encoding="utf-8"))
+        write_atomically(target, lambda file: file.write_text(_page(folder, runs), encoding="utf-8"))
     return target
 
 

@@ -24,7 +24,7 @@ def real_numbers(name: str, value: npt.ArrayLike) -> FloatArray:
     given = np.asanyarray(value)
     if given.dtype.kind not in REAL:
         raise ValueError(f"{name} must be real numbers, got {given.dtype}")
-    if np.ma.isMaskedArray(given) and np.ma.is_masked(given):
+    if type(given) is not np.ndarray and np.ma.is_masked(given):  # numpy.ma takes long to import
         raise ValueError(f"{name} must be numbers, got a masked array; write .filled(value)")
     return np.array(given, dtype=np.float64)
 

@@ -265,7 +265,7 @@ def test_blocks_are_made_when_a_worker_is_about_to_need_them():
     workers = Workers(submit, 3)
     outcomes = carry_out_blocks(cut(jobs(), 1, chunk=1), workers)
     assert [block.jobs[0].index for block, _ in itertools.islice(outcomes, 20)] == list(range(20))
-    assert len(made) <= 20 + workers.window
+    assert len(made) <= 20 + blocks.TASKS_PER_WORKER * workers.count
 
 
 def test_cells_of_a_plan_are_made_one_by_one():
