@@ -10,10 +10,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 METHODS = "ukf_mfac", "ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published"
 PERIODS = 200  # of a run of the task random

@@ -21,7 +21,8 @@ HOW = os.environ["HOSTILE"]
 
 def build(config, setup):
     plant = KINEMATIC.build(config, setup)
-    if int(abs(setup.start[0]) * 1e4) % 2 == 0:  # about half of the robots, and the start at which plug-ins are tried
+    share = 4 if HOW == "hang" else 2  # one of so many robots, and not the start at which plug-ins are tried
+    if int(abs(setup.start[0]) * 1e4) % share != 1:
         return plant
     if HOW == "build":
         raise RuntimeError("no licence")
@@ -76,7 +77,7 @@ def plugin(tmp_path) -> Path:
 
 @pytest.mark.parametrize(
     ("command", "how", "workers"),
-    [("compare", "exit", "1"), ("sweep", "build", "2"), ("sweep", "close", "1"), ("tune", "hang", "2")],
+    [("compare", "exit", "1"), ("sweep", "build", "1"), ("sweep", "close", "1"), ("tune", "hang", "2")],
 )
 def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
     out = tmp_path / "out"
