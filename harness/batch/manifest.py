@@ -53,7 +53,7 @@ def describe_batch(
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
         **{key: {each.name: each.record() for each in own if each.word == word} for word, key in OWN.items()},
-        "plugins": dict(_plugins(runs)),
+        "plugins": dict(plugins(runs)),
         "files": named_files(runs, configuration, own),
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
@@ -73,7 +73,7 @@ def describe_batch(
     }
 
 
-def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
+def plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield names of controllers, plants and tasks that others have installed, and the record of each."""
     kinds = (CONTROLLER_REGISTRY, runs.controllers), (PLANT_REGISTRY, runs.plants), (TASK_REGISTRY, runs.tasks)
     for name, point in ((name, registry.published(name)) for registry, names in kinds for name in names):

@@ -9,7 +9,9 @@ import servobench
 from kit.own import CELL, WHOLE
 from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
+from servobench.harness.config.registry import choose_plant, offering
 from servobench.harness.config.source import neighbours
+from servobench.harness.studies.tuning.objective import TuningSet, open_ledger
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.robot import ur5
 
@@ -59,6 +61,17 @@ def test_a_folder_is_not_resumed_with_another_version_of_a_file(case):
     line = f"^folder was begun with another version of (\\./)?{name}; name another folder with --out, or bring"
     with pytest.raises(ConfigurationError, match=line):
         servobench.compare(resume=True, **asked)
+
+
+def test_a_study_is_not_continued_with_another_version_of_a_module_of_its_plant():
+    write({"cell.py": f"import gear\n{CELL}", "gear.py": ""})
+    with offering():
+        runs = TuningSet((choose_plant("./cell.py"),))
+        open_ledger(Path(), "rls", runs).add({}, [1.0])
+        assert open_ledger(Path(), "rls", runs).costs({}) == [1.0]
+        write({"gear.py": "RATIO = 0.5"})
+        with pytest.raises(ConfigurationError, match=r"^study rls.jsonl was made with other plants"):
+            open_ledger(Path(), "rls", runs)
 
 
 def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():

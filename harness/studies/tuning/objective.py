@@ -33,7 +33,8 @@ import numpy as np
 
 from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
-from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
+from servobench.harness.batch.manifest import named_files, plugins
+from servobench.harness.batch.plan import TUNING, Cell, Survey, tuning_seeds
 from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant, offered
 from servobench.harness.config.settings import Settings, apply_settings, file_stem, flatten
@@ -303,11 +304,13 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
         "KINDS": KINDS, "LEVELS": LEVELS, "MODELS": MODELS, "TASKS": TASKS, "FLOOR": FLOOR,
         "MIN_DELAY_MARGIN": MIN_DELAY_MARGIN, "WORST": WORST,
     }  # fmt: skip
+    plants = Survey(plants=dict.fromkeys(runs.plants))
+    files = named_files(plants, {}, offered(runs.plants))
     fingerprint = {
         "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
         "objective": {name: repr(value) for name, value in constants.items()},
         "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
-        "plants": [*runs.plants, *(each.digest for each in offered(runs.plants))],
+        "plants": [*runs.plants, *files.values(), *(each["sha256"] for _, each in plugins(plants))],
         "robots": [runs.robots, runs.offset],
     }
     return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint)
