@@ -1,6 +1,5 @@
 """All figures of a results folder, from its tables alone."""
 
-import re
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from servobench.harness.pictures.style import (
     Styles,
     divisions,
     figure_style,
+    file_name,
     method_styles,
     save_figure,
 )
@@ -156,8 +156,7 @@ def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> Nam
         if title:
             wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
             figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
-    words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
-    stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
+    stem = file_name(plan.kind, plan.part, group.plant, group.mismatch)
     return NamedFigure(plan.kind, stem, f"{heading}: {details}", plan.tasks, figure)
 
 

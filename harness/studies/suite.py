@@ -66,8 +66,8 @@ def carry_out_suite(
     write_csv(judged, out / RUNS)
     for rows, name in ((methods_rows(judged), METHODS), (ranking_rows(judged), RANKING)):
         write_csv(pd.json_normalize(as_plain(rows)), out / name)
-    for plant, own in bounded(judged).groupby("plant", sort=False):
-        draw_suite(own, out / f"{PICTURE}_{Path(str(plant)).stem}")
+    for _, own in bounded(judged).groupby("plant", sort=False):
+        draw_suite(own, out)
     return judged
 
 
@@ -154,16 +154,18 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             own = bounded(judged[judged["plant"] == plant])
             title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
-                title += f"; halves of the robots differ by {resolution(own):.3f} in the score"
+                apart = resolution(own)
+                shown = f"{'less than ' * (apart < 0.0005)}{max(apart, 0.001):.3f}"
+                title += f"; halves of the robots differ by {shown} in the score"
             yield title, place.drop(columns="plant")
 
 
-def draw_suite(runs: pd.DataFrame, stem: Path) -> list[Path]:
+def draw_suite(runs: pd.DataFrame, folder: Path) -> list[Path]:
     """Draw performance profiles and the mean score of each method in each challenge; return the files.
 
     Args:
         runs: bounded judged runs of one plant.
-        stem: of the files.
+        folder: of the files, which the plant names.
     """
     means = runs.pivot_table("score", "controller", "challenge", sort=False)
     means = means.loc[[each.controller for each in ranking(runs)]]
@@ -179,7 +181,7 @@ def draw_suite(runs: pd.DataFrame, stem: Path) -> list[Path]:
         top.set_title(f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}")
         _draw_scores(bottom, means)
         style.add_legend(figure, [top])
-    return style.save_figure(figure, stem)
+    return style.save_figure(figure, folder / style.file_name(PICTURE, str(runs["plant"].iloc[0])))
 
 
 def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:

@@ -23,6 +23,7 @@ from servobench.harness.studies.suite import (
     RANKING,
     RUNS,
     bounded,
+    draw_suite,
     judge,
     methods_rows,
     ranking_rows,
@@ -169,6 +170,19 @@ def test_a_challenge_whose_references_fail_has_no_part_in_the_ranking():
     rescued = lost | {"nmpc_calibrated": [-1.0] + [1.0] * 19}  # one of the two holds on this robot
     judged = judge(challenge("settling"), table_of(rescued, "settling_time_s", "point_to_point", 0.005))
     assert {row["controller"].value for row in ranking_rows(judged)} == set(lost)
+    judged = judge(
+        challenge("settling"), table_of({"calibrated": [1.0] * 4}, "settling_time_s", "point_to_point", 0.005)
+    )
+    *_, (title, _) = suite_tables(judged)
+    assert title.endswith("halves of the robots differ by less than 0.001 in the score")
+
+
+def test_pictures_of_two_mappings_of_one_name_are_four_files(tmp_path):
+    judged = judge(
+        challenge("settling"), table_of({"calibrated": [1.0] * 2}, "settling_time_s", "point_to_point", 0.005)
+    )
+    drawn = [draw_suite(judged.assign(plant=f"fmu:{folder}/arm.toml"), tmp_path) for folder in "ab"]
+    assert len({*drawn[0], *drawn[1]}) == 4
 
 
 def test_a_reference_of_some_challenges_only_has_no_rank():
