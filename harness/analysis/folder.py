@@ -26,7 +26,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    manifest = results.read_manifest(folder)
+    manifest, runs = results.read_manifest(folder), name_twins(folder, runs)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
     described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(runs.columns)
@@ -37,6 +37,13 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {by}{commit}"
     made += f", Python {manifest.get('python', 'unknown')}"
     return facts | {"seeds": _seeds(runs["seed"].tolist()), "made": made}
+
+
+def name_twins(folder: Path, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a folder's runs for titles: the mismatch of robots that were drawn from a twin, which is none, says so."""
+    robots = results.read_manifest(folder).get("robots") or ()
+    drawn = any(str(each.get("title")).endswith(" twin") for each in robots)
+    return runs.replace({"mismatch": {"none": "drawn from the twin"}}) if drawn else runs
 
 
 def describe_controllers(folder: Path) -> str:
@@ -148,13 +155,12 @@ def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:
     used = [f"{name} {packages[name]}" for name in ("numpy", "scipy") if packages.get(name)]
     used += [str(engine) for engine in (manifest.get("engines") or {}).values()]
     robots = ", ".join(str(each.get("title")) for each in manifest.get("robots", [])) or "unknown robot"
-    mismatch = facts["mismatch"].replace("none", "drawn from the twin" if robots.endswith(" twin") else "none")
     seeds, count = facts["seeds"].partition(" (")[0], runs["seed"].nunique()
     sentences = [
         f"All runs were made with servobench {version}~\\cite{{servobench}} (commit {commit}, "
         + f"Python {manifest.get('python', 'unknown')}, {', '.join(used)})".translate(SIGNS),
         f"Controllers: {facts['controller']}; tasks: {facts['task']}; plant: {facts['plant']} ({robots}); "
-        f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {mismatch}",
+        f"sensing: {facts.get('sensing', 'position')}; mismatch between true and nominal robot: {facts['mismatch']}",
         *[f"Aids (stages around the law, which any controller can have): {aids}"] * bool(aids),
         *_varied(facts, runs),
         f"Every controller met the same {count} random robot{'s' * (count > 1)} (seeds {seeds}; {len(runs)} runs)",

@@ -42,12 +42,13 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
+    from servobench.harness.analysis.folder import latex_tables, methods_paragraph, name_twins
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
     if markdown + latex + as_json > 1:
         raise ConfigurationError("--markdown, --latex and --json are ways to print the same; give one of them")
-    runs = results.load_runs(folder)
+    runs = name_twins(folder, results.load_runs(folder))
     missing = results.describe_missing(folder)
     if as_json:
         sys.stderr.write(f"{missing}\n" * bool(missing))
@@ -60,8 +61,6 @@ def statistics(
     say(f"% {missing}" if latex and missing else missing)
     tables = statistics_tables(runs, metric)
     if latex:
-        from servobench.harness.analysis.folder import latex_tables, methods_paragraph
-
         say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
         return
     print_markdown(tables) if markdown else print_tables(tables)

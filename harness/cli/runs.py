@@ -163,6 +163,7 @@ def _carry_out(
     campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
+    from servobench.harness.analysis.folder import name_twins
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
@@ -173,7 +174,7 @@ def _carry_out(
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
         runs = results.load_runs(folder)
-        print_tables(summary_tables(runs), summary_legend(runs))
+        print_tables(summary_tables(name_twins(folder, runs)), summary_legend(runs))
         say_aids(folder)
         print_faults(folder, runs)
         if out is None:

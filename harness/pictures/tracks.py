@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import POINT_TO_POINT, column_of, handy_unit, settling_times, with_places
+from servobench.harness.analysis.folder import name_twins
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -127,7 +128,7 @@ class Group:
     """The runs that belong into one figure: of one plant and mismatch, and in each task of one seed."""
 
     plant: str
-    mismatch: str  # as it was given
+    mismatch: str  # as it was given, or words for that of a twin
     runs: pd.DataFrame  # all of this plant and mismatch
     seed: int  # of the runs in `tasks`
     tasks: dict[str, Tracks]  # task -> controller -> track; tasks without any step are left out
@@ -139,7 +140,8 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
+    named = with_places(name_twins(folder, runs))
+    for (plant, mismatch), group in named.groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
         for track in load_tracks(folder, chosen):

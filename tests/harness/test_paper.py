@@ -8,9 +8,11 @@ import pytest
 
 from kit.command import carried_out, servobench
 from kit.folders import sweep
-from servobench.harness.analysis.folder import latex_tables, methods_paragraph
+from servobench.harness.analysis.folder import describe_folder, latex_tables, methods_paragraph, name_twins
+from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch.api import compare
 from servobench.harness.batch.results import load_runs
+from servobench.harness.pictures.figures import Choice, folder_figures
 
 TABLE = pd.DataFrame(
     {
@@ -71,6 +73,7 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     compare(
         ["constant"],
         tasks=["exp2"],
+        plants=["kinematic"],
         robot=str(twin),
         mismatches=["none"],
         settings={"exp2": {"duration": 0.5}},
@@ -78,6 +81,12 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     )
     text = methods_paragraph(out, load_runs(out))
     assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text
+    (drawn,) = folder_figures(out, Choice(["effort"]))
+    assert drawn.title.endswith("kinematic, mismatch drawn from the twin, seed 0")
+    assert describe_folder(out, load_runs(out))["mismatch"] == "drawn from the twin"
+    assert [title for title, _ in statistics_tables(name_twins(out, load_runs(out)))] == [
+        "exp2 on kinematic, drawn from the twin"
+    ]
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
