@@ -14,11 +14,10 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.batch.blocks import can_travel
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import MAX_SEEDS, Batch, Cell, Grid, check_seeds, refuse_tuning_seeds
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.config.registry import choose_controller, choose_plant, offered, offering
+from servobench.harness.config.registry import can_travel, choose_controller, choose_plant, offered, offering
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import DEFAULT_ROBOT, RunRequest, read_mismatch, read_seed
@@ -123,7 +122,7 @@ def compare(
         sensings: see `run`.
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
-        workers: number of processes, or of those that `executor` has.
+        workers: number of processes, or of those of an executor that does not say how many it has.
         executor: of `concurrent.futures`, which carries the runs out in processes of its own, also on other machines:
             a `ProcessPoolExecutor`, `MPIPoolExecutor` of mpi4py, or `client.get_executor(pure=False)` of Dask.
         run_timeout: [s] time limit of a run; None for the usual one, if any.

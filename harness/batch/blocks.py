@@ -21,7 +21,7 @@ import zlib
 from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
 from io import BytesIO
 from itertools import groupby, islice
@@ -38,6 +38,7 @@ from servobench.harness.batch.processes import Bounds, Limits, available_process
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config.registry import (
     Offer,
+    can_travel,
     find_controller,
     find_plant,
     is_foreign_controller,
@@ -361,15 +362,6 @@ MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.bl
 ONE_TASK: Final = threading.Lock()  # held by the one task that a process of an executor carries out at a time
 
 
-def can_travel(own: Sequence[Offer]) -> bool:
-    """Return whether a worker process can receive controllers and plants that users gave."""
-    try:
-        text = pickle.dumps(own)
-    except Exception:  # noqa: BLE001 - code of users may raise anything
-        return False
-    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")
-
-
 @contextlib.contextmanager
 def open_workers(
     count: int | None = None,
@@ -405,14 +397,21 @@ def open_workers(
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
     count = count or min(MAX_DEFAULT_WORKERS, available_processors())
     if scheduler is not None:
-        for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
+        typed = isinstance(scheduler, str)
+        for name, value in (("run_timeout", bounds.run_timeout), ("run_memory", bounds.run_memory)):
             if value is not None:
+                option = f"--{name.replace('_', '-')}" if typed else name
                 raise ConfigurationError(f"{option} works with processes of this machine only, not on a cluster")
-        if isinstance(scheduler, Executor):
-            yield _workers_of(scheduler, count)
-            return
-        with _open_cluster(scheduler) as workers:
-            yield workers
+        place = _open_cluster(scheduler) if isinstance(scheduler, str) else contextlib.nullcontext(scheduler)
+        try:
+            with place as executor:
+                yield _workers_of(executor, count)
+        except (BrokenExecutor, CancelledError) as error:
+            again = ", where it has it with --resume," if typed else " with out and resume=True"
+            raise ConfigurationError(
+                f"the workers ended: {str(error).rstrip('.') or 'no scheduler answers'}; finished runs are kept, and "
+                f"the same call{again} carries out the others; with processes of this machine, a fatal run is a row"
+            ) from error
         return
     foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
     foreign = foreign or any(map(is_foreign_controller, controllers))
@@ -428,10 +427,10 @@ def open_workers(
 
 
 @contextlib.contextmanager
-def _open_cluster(scheduler: str) -> Iterator[Workers]:
+def _open_cluster(scheduler: str) -> Iterator[Executor]:
     if not re.fullmatch(r"(?:[a-z]+://)?\S+:\d+", scheduler):
         raise ConfigurationError(f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}")
-    from distributed import Client, KilledWorker  # noqa: PLC0415 - only the extra cluster brings it
+    from distributed import Client  # noqa: PLC0415 - only the extra cluster brings it
 
     try:
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
@@ -447,14 +446,17 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
             raise ConfigurationError(
                 f"the scheduler {scheduler} has no workers; start some with `dask worker {scheduler} --nthreads 1`"
             ) from error
-        threads = sum(client.nthreads().values())
-        yield _workers_of(client.get_executor(pure=False), threads, lost=(KilledWorker,))
+        yield client.get_executor(pure=False)
 
 
-def _workers_of(executor: Executor, count: int, lost: tuple[type[BaseException], ...] = ()) -> Workers:
-    """Return the workers of an executor; `lost` are the errors of its futures whose process died."""
+def _workers_of(executor: Executor, count: int) -> Workers:
+    """Return the workers of an executor, `count` where it does not say how many it has."""
     if isinstance(executor, ThreadPoolExecutor):
         raise ConfigurationError("an executor must have processes: threads would share the state of solvers and files")
+    lost: tuple[type[BaseException], ...] = ()
+    if (dask := sys.modules.get("distributed")) and isinstance(executor, dask.cfexecutor.ClientExecutor):
+        count, lost = sum(executor._client.nthreads().values()), (dask.KilledWorker,)
+    count = getattr(executor, "_max_workers", count)
     return Workers(lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost)
 
 

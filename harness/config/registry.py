@@ -6,7 +6,9 @@ that a user gives as files or objects are offered under a name for as long as a 
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import pickle
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -57,6 +59,15 @@ def offering(given: Iterable[Offer] = ()) -> Iterator[None]:
 def offered(names: Iterable[str]) -> tuple[Offer, ...]:
     """Return those of the controllers and plants `names` that users gave."""
     return tuple(_OFFERED[name] for name in names if name in _OFFERED)
+
+
+def can_travel(own: Sequence[Offer]) -> bool:
+    """Return whether a worker process can receive controllers and plants that users gave."""
+    try:
+        text = pickle.dumps(own)
+    except Exception:  # noqa: BLE001 - code of users may raise anything
+        return False
+    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")
 
 
 @dataclass(frozen=True, eq=False)

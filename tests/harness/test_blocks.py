@@ -7,7 +7,8 @@ import math
 import pickle
 import time
 import zlib
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from kit.command import judged
 from kit.nightly import some
 from servobench.harness.batch import blocks, results
-from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size, open_workers
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
@@ -76,8 +77,35 @@ def test_any_executor_gives_the_rows_of_this_process(alone, tmp_path, make):
 def test_an_executor_of_threads_or_with_limits_of_runs_is_refused(tmp_path):
     with ThreadPoolExecutor(1) as threads, pytest.raises(ConfigurationError, match="an executor must have processes"):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, threads))
-    with pytest.raises(ConfigurationError, match="works with processes of this machine only"):
+    with pytest.raises(ConfigurationError, match="^run_timeout works with processes of this machine only"):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Here(), Bounds(5.0)))
+
+
+class Ended(Executor):
+    """An executor whose workers have ended."""
+
+    def __init__(self, error):
+        self.error = error
+
+    def submit(self, function, /, *arguments, **named):
+        future = Future()
+        future.set_exception(self.error)
+        return future
+
+
+@pytest.mark.parametrize(
+    ("error", "why"), [(BrokenProcessPool("a process died."), "a process died"), (CancelledError(), "no scheduler")]
+)
+def test_an_executor_whose_workers_end_is_one_line_that_says_how_to_go_on(tmp_path, error, why):
+    line = f"^the workers ended: {why}.*; finished runs are kept, and the same call with out and resume=True carries"
+    with pytest.raises(ConfigurationError, match=line):
+        carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Ended(error)))
+    carry_out(CAMPAIGN, tmp_path / "out", Execution(1, resume=True))
+
+
+def test_an_executor_that_says_how_many_workers_it_has_gets_work_for_all():
+    with ProcessPoolExecutor(3) as executor, open_workers(1, executor) as workers:
+        assert workers.count == 3
 
 
 def _say_twice(_argument, tell):

@@ -73,7 +73,6 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     compare(
         ["constant"],
         tasks=["exp2"],
-        plants=["kinematic"],
         robot=str(twin),
         mismatches=["none"],
         settings={"exp2": {"duration": 0.5}},
@@ -81,7 +80,7 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     )
     text = methods_paragraph(out, load_runs(out))
     assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text
-    (drawn,) = folder_figures(out, Choice(["effort"]))
+    (drawn,) = folder_figures(out, Choice(["errors"]))
     assert drawn.title.endswith("kinematic, mismatch drawn from the twin, seed 0")
     assert describe_folder(out, load_runs(out))["mismatch"] == "drawn from the twin"
     assert [title for title, _ in statistics_tables(name_twins(out, load_runs(out)))] == [
