@@ -216,7 +216,7 @@ def _drive(plant: Plant, setup: PlantSetup) -> tuple[FloatArray, FloatArray, Tru
         raise CheckFailed(f"spec has {spec.n} joints and the start {len(start)}: take their number from setup.robot()")
     if setup.model is not None and len(setup.model.channel.names) != spec.m:
         has, camera = (f"{', '.join(each.names)} in {each.unit}" for each in (spec.feature, setup.model.channel))
-        remedy = "of which controllers get the Jacobian: measure these, or bring a robot of your own, own_robot = True"
+        remedy = "of which controllers get the Jacobian: measure these, or set own_robot = True and bring arm and start"
         raise CheckFailed(f"spec has the features {has}, and the camera of the setup has {camera}, {remedy}")
     first = plant.reset(0).joint_position
     if start is not None and not np.abs(first - start).max() <= START_TOLERANCE:

@@ -186,7 +186,7 @@ class PlantSetup:
             ValueError: there are none, or a start of the wrong shape.
         """
         if self.model is None or self.start is None:
-            raise ValueError("model and start must be given for this plant, got None")
+            raise ValueError("the setup has no robot: a plant with own_robot = True brings its arm, start and limits")
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
 
 

@@ -193,6 +193,11 @@ OTHER = "; this happens with a period of 100 ms and the robot panda"
             '"u", "v"',
             "run: spec has the features u, v in m, and the camera of the setup has x, y, z in m",
         ),
+        (
+            "    def __init__",
+            "    own_robot = True\n\n    def __init__",
+            "ValueError: the setup has no robot: a plant with own_robot = True brings its arm, start and limits",
+        ),
         (SEEN, SEEN.replace("\n", "[[1, 0, 2]]\n", 1), "truth: at rest truth().feature is ["),
         (SEEN, SEEN.replace("\n", " * [1, 1, 1000]\n", 1), "; both are of one camera, in one order and unit"),
         ("setup.robot()", "setup.nominal.nominal, setup.start", "; the plant has to be the robot and camera that"),
