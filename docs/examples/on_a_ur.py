@@ -114,6 +114,10 @@ class UR(servobench.Plant):
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & {*sys.argv}:
+        sys.exit(
+            print(f"{__doc__}\n{URConfig.__doc__} All others are those of servobench run; see servobench run --help.")
+        )
     usual = "run --no-isolate --robot ur5e --mismatch none --task target --set run.lost_after=0.1 --no-figures --plant"
     sys.argv[1:] = [*usual.split(), __file__, *(w.replace("--dry-run", "--set=UR.dry_run=true") for w in sys.argv[1:])]
     main()

@@ -141,6 +141,7 @@ def compare(
     for name, value in {"workers": workers, "run_timeout": run_timeout, "run_memory": run_memory}.items():
         fits = value is None or (isinstance(value, int | float | np.number) and value > 0)
         _require(fits, name, "a number above 0", value)
+        _require(value is None or value < 1e300 or value == np.inf, name, "below 1e300, or inf for no limit", value)
     _require(workers is None or workers % 1 == 0, "workers", "a whole number", workers)
     _require(isinstance(executor, Executor | None), "executor", "an executor of concurrent.futures", executor)
     for name, switch in {"isolate": isolate, "resume": resume}.items():
@@ -180,7 +181,7 @@ def _seeds(given: object) -> Sequence[int]:
 def _require(fits: bool, name: str, wanted: str, came: object) -> None:
     """Raise a `ConfigurationError` that names an argument unless it is as wanted."""
     if not fits:
-        raise ConfigurationError(f"{name} must be {wanted}, got {came!r}")
+        raise ConfigurationError(f"{name} must be {wanted}, got {came!r:.80}")
 
 
 def _check_lists(**given: object) -> None:

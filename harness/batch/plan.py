@@ -207,7 +207,7 @@ class SweepPlan:
             name, _, values = (part.strip() for part in text.partition("="))
             if name in settings:
                 raise ConfigurationError(f"--vary gives {name} twice; give all values in one place")
-            with configuration_errors("--vary: "):
+            with configuration_errors("" if name in SHORT_NAMES else "--vary: "):
                 if name in SHORT_NAMES or "." in name:
                     settings[name] = parse_values(name, values)
                 else:

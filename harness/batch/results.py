@@ -368,7 +368,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         why = f"its {MANIFEST} cannot be read" if folder.exists() else "it does not exist"
-        inside = (f"take one that is in it, such as {each.parent}" for each in sorted(folder.glob(f"*/{MANIFEST}")))
+        there = [] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
+        inside = (f"take one that is in it, such as {each.parent}" for each in there)
         raise ConfigurationError(f"{folder} is not a results folder: {next(inside, why)}") from error
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
     if version != SCHEMA_VERSION:

@@ -200,7 +200,7 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
         return Experiment(plant, controller, (drawn,), resolved.run, networks)
     brings = f"plant {request.plant} brings a"
     if request.mismatch != Mismatch():
-        raise ConfigurationError(f"{brings} robot of its own, to which mismatches do not apply; use --mismatch none")
+        raise ConfigurationError(f"{brings} robot of its own, to which mismatches do not apply; use the mismatch none")
     if request.sensing != DEFAULT_SENSING:
         raise ConfigurationError(f"{brings} sensor of its own, so --sensing {request.sensing} does not apply")
     plant, controller, networks = _assemble(resolved, None, None, progress)

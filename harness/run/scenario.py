@@ -13,7 +13,7 @@ import numpy as np
 
 from servobench.harness.run.references import FixedPoint, FollowedCurve, Reference, TaskKind, TaughtImage
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_vector, check_number, real_numbers
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
@@ -37,7 +37,8 @@ class Scenario:
         """Check that the evaluated part is one of the run, and the kind."""
         if self.kind not in get_args(TaskKind):
             raise ValueError(f"kind must be one of {', '.join(get_args(TaskKind))}, got {self.kind!r}")
-        if not 0.0 <= self.evaluate_from < self.duration:
+        check_number("duration", self.duration, above=0.0)
+        if not 0.0 <= real_numbers("evaluate_from", self.evaluate_from) < self.duration:
             raise ValueError(f"evaluate_from must be in the run of {self.duration:g} s, got {self.evaluate_from:g} s")
 
 

@@ -29,6 +29,7 @@ from servobench.harness.serve import wire
 from servobench.harness.serve.program import COMMAND, ControlProgram, script_version
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.files import reason
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
@@ -119,7 +120,8 @@ class Server:
                     remedy = "serve at another address of this machine, such as --address 127.0.0.2"
                     if error.errno == errno.EADDRINUSE:
                         remedy = f"end what uses it, or {remedy}"
-                    failed = f"{name} port {port} of {address} cannot be opened: {os.strerror(error.errno or 0)}"
+                    why = reason(error) if (error.errno or 0) < 0 else os.strerror(error.errno or 0)  # of the address
+                    failed = f"{name} port {port} of {address} cannot be opened: {why}"
                     raise ConfigurationError(f"{failed}; {remedy}") from error
                 stack.callback(server.close)
             if not ipaddress.ip_address(address).is_loopback:

@@ -22,7 +22,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.pictures.measures import draw_places
 from servobench.harness.pictures.style import figure_style, method_styles, save_figure
 from servobench.harness.studies.claims import MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
-from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import read_text, write_atomically
 
 MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
@@ -142,8 +142,11 @@ def read_answers(path: Path) -> Answers:
         ConfigurationError: the file is not a table of answers.
     """
     text, columns = read_text("table of answers", path), ["claim", "plant", "division", "verdict", "evidence"]
-    with configuration_errors(f"{path} is not a table of answers, such as {ANSWERS} of a folder of claims: "):
+    try:
         table = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False, comment="#", usecols=columns)
+    except ValueError as error:
+        wanted = f"with the columns {', '.join(columns)}, such as {ANSWERS} of a folder of claims"
+        raise ConfigurationError(f"{path} is not a table of answers: wanted one {wanted}") from error
     return {tuple(key): (verdict, evidence) for *key, verdict, evidence in table[columns].itertuples(index=False)}
 
 

@@ -174,8 +174,8 @@ class SensingSetup:
 
     def _check_array(self, name: str, made: object, shape: tuple[int, ...], points: FloatArray) -> None:
         """Refuse what a function called `name` made of points (..., c, p, 3), unless it is finite floats of a shape."""
-        if not isinstance(made, np.ndarray) or made.shape != shape or made.dtype not in FLOATS:
-            came = f"{made.dtype} of shape {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
+        if type(made) is not np.ndarray or made.shape != shape or made.dtype not in FLOATS:
+            came = f"{made.dtype} of shape {made.shape}" if type(made) is np.ndarray else type(made).__name__
             wanted = f"float64 or float32 of shape {shape} for points {points.shape}, as points[..., 0, 0, :]"
             raise ConfigurationError(f"sensing {self.name}: {name} must return {wanted}, got {came}")
         if not np.isfinite(made).all():

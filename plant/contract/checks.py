@@ -60,7 +60,7 @@ def check_number(name: str, value: float, *, above: float) -> None:
     Raises:
         ValueError: it is not; names the argument, the wanted and the given value.
     """
-    if not above < value < math.inf:
+    if not above < real_numbers(name, value) < math.inf:
         raise ValueError(f"{name} must be above {above:g}, got {value}")
 
 

@@ -40,7 +40,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             error.filename = str(path)  # that of the user: a full disk names no file, other errors the partial one
         raise
     finally:
-        partial.unlink(missing_ok=True)
+        if partial.exists():  # not below a file, for instance
+            partial.unlink()
 
 
 @contextmanager

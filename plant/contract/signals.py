@@ -7,13 +7,14 @@ command of instant t_k; the command acts on [t_k, t_{k+1}).
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_vector, is_finite, real_numbers
+from servobench.plant.contract.checks import FloatArray, as_array, as_vector, check_number, is_finite, real_numbers
 
 BoolArray = npt.NDArray[np.bool_]
 JOINT_UNIT = "rad"
@@ -43,8 +44,11 @@ class Channel:
 
     def __post_init__(self) -> None:
         """Check sizes and signs and freeze the arrays."""
-        if not (np.isfinite(self.scale) and self.scale > 0.0):
-            raise ValueError(f"scale must be positive, got {self.scale} {self.unit}")
+        check_number("scale", self.scale, above=0.0)
+        given: object = self.names
+        listed = isinstance(given, Sequence) and not isinstance(given, str)
+        if not listed:
+            raise ValueError(f"names of joints and features must be lists, got {self.names!r}")
         for name in ("lower", "upper"):
             bound = np.array(getattr(self, name), dtype=np.float64)
             if bound.shape != (len(self.names),) or np.isnan(bound).any():
@@ -82,14 +86,15 @@ class PlantSpec:
 
     def __post_init__(self) -> None:
         """Check sizes and signs."""
+        if {type(self.feature), type(self.command)} != {Channel}:
+            raise ValueError(f"feature and command must be Channels, got {self.feature!r} and {self.command!r}")
         for name in ("joint_lower", "joint_upper"):
             object.__setattr__(self, name, as_vector(name, getattr(self, name), self.n))
         if not (self.joint_lower < self.joint_upper).all():
             raise ValueError("joint_lower must be below joint_upper for every joint")
         if not (self.command.lower == -self.command.upper).all():
             raise ValueError(f"command limits must be symmetric, got {self.command.lower} and {self.command.upper}")
-        if not self.period > 0.0:
-            raise ValueError(f"period must be positive, got {self.period} s")
+        check_number("period", self.period, above=0.0)
 
     @classmethod
     def of_joints(
@@ -113,10 +118,10 @@ class PlantSpec:
             period: control period, s.
             feature_unit: unit of the features.
         """
-        limit = as_vector("joint_velocity_limit", joint_velocity_limit, len(joint_names))
+        limit = as_vector("joint_velocity_limit", joint_velocity_limit, np.size(joint_names))
         if not (limit > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {limit.tolist()}")
-        unbounded = np.full(len(feature_names), np.inf)
+        unbounded = np.full(np.size(feature_names), np.inf)
         return cls(
             feature=Channel(feature_names, feature_unit, 1.0, -unbounded, unbounded),
             command=Channel(joint_names, "rad/s", 1.0, -limit, limit),
@@ -178,11 +183,10 @@ class Observation:
 
     def __post_init__(self) -> None:
         """Check that everything is finite and freeze the arrays."""
-        if not np.isfinite(self.time):
-            raise ValueError(f"time must be finite, got {self.time}")
+        as_array("time", self.time, ())
         for name in ("joint_position", "feature"):
             value = getattr(self, name)
-            object.__setattr__(self, name, as_vector(name, value, len(value)))
+            object.__setattr__(self, name, as_vector(name, value, np.size(value)))
         given = len(self.valid) > 0
         valid = np.array(self.valid, dtype=np.bool_) if given else np.full(len(self.feature), self.feature_valid)
         if valid.shape != self.feature.shape:

@@ -203,7 +203,7 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     assert differences([replace(answers[0], plant="bullet")], wanted) == [
         "claim 1 on bullet, best equipped: not in the table"
     ]
-    with pytest.raises(ConfigurationError, match=r"measurements.csv is not a table of answers.*not found: .*verdict"):
+    with pytest.raises(ConfigurationError, match=r"measurements.csv is not a table of answers: wanted .*verdict"):
         read_answers(tmp_path / "measurements.csv")
 
 

@@ -175,6 +175,8 @@ def of_schema_3(folder: Path) -> None:
         (lambda folder: None, "verify DIR", "DIR is not a results folder: it does not exist"),
         (lambda folder: sweep(folder / "slow"), "statistics DIR", "DIR is not a results folder: take one that is in "
          "it, such as DIR/slow"),
+        (lambda folder: (sweep(folder / "slow"), (folder / "manifest.json").write_text("{")), "statistics DIR",
+         "DIR is not a results folder: its manifest.json cannot be read"),
     ],
 )  # fmt: skip
 def test_what_a_folder_lacks_is_named(refusal_of, monkeypatch, tmp_path, make, command, words):

@@ -244,6 +244,10 @@ def in_place(points, optics):
             {"measure": lambda points, _: points[0, 0, :2]},
             r"measure must return .* of shape \(5, 2\) for points \(5, 1, 1, 3\), .* got float64 of shape \(1, 3\)",
         ),
+        (
+            {"measure": lambda points, _: np.ma.masked_less(points[..., 0, 0, :2], 0.5)},
+            "measure must return .*, got MaskedArray",
+        ),
         ({"measure": lambda points, _: points[..., 0, 0, :2].tolist()}, "measure must return .*, got list"),
         (
             {"measure": lambda points, _: points[..., 0, 0, :2].astype(np.float16)},

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from servobench.harness.run.scenario import Scenario
 from servobench.plant.contract.checks import check_number, whole_steps
 from servobench.plant.contract.signals import Channel, Command, Observation, PlantSpec
 
@@ -27,7 +28,7 @@ def test_an_observation_must_be_finite(name):
         ([0.0], [-1.0], 0.1, "joint_velocity_limit must be positive"),
         ([1.0, 1.0], [-1.0], 0.1, "joint_velocity_limit must have shape"),
         ([1.0], [3.0], 0.1, "joint_lower must be below joint_upper"),
-        ([1.0], [-1.0], 0.0, "period must be positive"),
+        ([1.0], [-1.0], 0.0, "period must be above 0, got 0.0"),
     ],
 )
 def test_a_spec_is_checked(speed, lower, period, message):
@@ -40,6 +41,20 @@ def test_a_number_is_held_against_its_bounds():
     for value in (0.0, np.inf, np.nan):
         with pytest.raises(ValueError, match=f"x must be above 0, got {value}"):
             check_number("x", value, above=0.0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Observation(None, [0.0], [0.0]), lambda: Observation(0.0, None, [0.0]),
+        lambda: PlantSpec(None, None, [0.0], [1.0], 0.1), lambda: PlantSpec.of_joints(None, ("x",), [1], [0], [1], 0.1),
+        lambda: PlantSpec.of_joints(("a",), "xy", [1], [0], [1], 0.1), lambda: Scenario(None, None, None, 0.0),
+        lambda: PlantSpec.of_joints(("a",), ("x",), [1], [0], [1], None), lambda: Scenario(None, None, 1.0, None),
+    ],
+)  # fmt: skip
+def test_none_and_a_text_for_names_are_refused_by_their_argument(make):
+    with pytest.raises(ValueError, match=r"(must be real numbers|names .* must be lists|must be Channels), got"):
+        make()
 
 
 def test_a_period_is_a_whole_number_of_own_steps():
@@ -70,7 +85,7 @@ def test_a_spec_describes_features_and_commands_as_channels():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scale": 0.0}, "scale must be positive, got 0.0 m"),
+        ({"scale": 0.0}, "scale must be above 0, got 0.0"),
         ({"lower": np.zeros(2)}, "lower must hold 1 numbers, got"),
         ({"upper": np.array([np.nan])}, "upper must hold 1 numbers, got"),
         ({"lower": np.array([2.0])}, "lower must be below upper for every one of x"),
