@@ -295,7 +295,7 @@ def grouped(rows: Any) -> pd.DataFrame:  # noqa: ANN401 - rows, or columns by th
 
 def texts_of(runs: pd.DataFrame, name: str) -> pd.Series[Any]:
     """Return a column of the table of runs, NaN throughout where the table has none of this name."""
-    return runs.reindex(columns=[name])[name]
+    return runs[name] if name in runs else pd.Series(np.nan, index=runs.index, name=name)
 
 
 def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
@@ -332,7 +332,7 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
 
 def achievement(runs: pd.DataFrame) -> str:
     """Return the word for a good outcome of these runs of one task: `settled`, or `followed` on a curve."""
-    return FOLLOWED if len(split_tasks(runs)[1]) else SETTLED
+    return FOLLOWED if (texts_of(runs, "task_kind") == CURVE).any() else SETTLED
 
 
 def handy_unit(feature_unit: str | None) -> tuple[str, float]:
@@ -357,8 +357,8 @@ def metric_heading(name: str, runs: pd.DataFrame) -> str:
 
 def is_superfluous(name: str, runs: pd.DataFrame) -> bool:
     """Return whether a metric repeats another one: these runs have no second lap, or it is the judged part."""
-    judged, second = column_of(runs, "rms_error_evaluated"), column_of(runs, SECOND_LAP)
-    return name == SECOND_LAP and (second.isna() | (second == judged)).all().item()
+    second = texts_of(runs, name)
+    return name == SECOND_LAP and (second.isna() | (second == column_of(runs, "rms_error_evaluated"))).all().item()
 
 
 def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:

@@ -428,15 +428,15 @@ def _by_task(runs: pd.DataFrame, kind: str) -> dict[str, pd.DataFrame]:
 def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool) -> pd.DataFrame:
     """Return medians of measures with their intervals in groups of columns, a row for each of `keys` and controller."""
     rows = []
+    columns = [(group, metric_heading(name, runs), name) for group, name in _columns(kind, runs)]
     for row, own in _rows(runs, keys):
         if counted:
             row["Runs", "number"] = str(len(own))
             row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
         else:
             row["Runs", "lost [%]"] = f"{100.0 - achieved_share(own).value:.0f}"
-        for group, name in _columns(kind, runs):
-            middle = _median_of(own, name, shown_unit(name, runs)[1])
-            row[group, metric_heading(name, runs)] = f"{middle:.{METRICS[name].digits}f}"
+        for group, heading, name in columns:
+            row[group, heading] = f"{_median_of(own, name, shown_unit(name, runs)[1]):.{METRICS[name].digits}f}"
         rows.append(row)
     return grouped(rows)
 

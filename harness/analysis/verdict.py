@@ -20,6 +20,7 @@ from servobench.harness.analysis.comparison import (
     MIN_PAIRS,
     Difference,
     achieved_share,
+    achievement,
     column_of,
     grouped,
     is_majority,
@@ -35,7 +36,7 @@ from servobench.harness.analysis.comparison import (
     split_tasks,
 )
 from servobench.harness.run.metrics import METRICS
-from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.outcome import ACHIEVED, FOLLOWED
 from servobench.harness.run.result import COMPLETED
 
 NAMED, MANY = 3, 6  # controllers that a sentence names at most
@@ -76,9 +77,8 @@ def ranked_controllers(runs: pd.DataFrame) -> list[str]:
 
 def asked_of(runs: pd.DataFrame) -> str:
     """Return the goal of these runs as a verb in the past tense."""
-    moves, curves = (len(part) for part in split_tasks(runs))
-    words = {(True, False): "settled", (False, True): "followed the curve"}
-    return words.get((moves > 0, curves > 0), "settled or followed the curve")
+    words: dict[tuple[bool, ...], str] = {(True, False): "settled", (False, True): "followed the curve"}
+    return words.get(tuple(len(part) > 0 for part in split_tasks(runs)), "settled or followed the curve")
 
 
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
@@ -92,7 +92,7 @@ def leaders(runs: pd.DataFrame) -> pd.DataFrame:
 
 def judged_metric(place: pd.DataFrame) -> str:
     """Return the column by which the runs of a place are compared."""
-    return "rms_error_evaluated" if len(split_tasks(place)[1]) else "settling_time_s"
+    return "rms_error_evaluated" if achievement(place) == FOLLOWED else "settling_time_s"
 
 
 def judged_values(place: pd.DataFrame) -> pd.DataFrame:
@@ -117,7 +117,7 @@ def _of_one_run(runs: pd.DataFrame) -> str:
     if row["status"] != COMPLETED:
         return f"`{name}` ended {place} early: {row['status']}."
     unit, factor = shown_unit("rms_error_evaluated", runs)
-    if len(split_tasks(runs)[1]):
+    if achievement(runs) == FOLLOWED:
         verb = "followed" if row["outcome"] in ACHIEVED else f"did not follow ({row['outcome']})"
         return f"`{name}` {verb} {place} with an RMS error of {factor * row['rms_error_evaluated']:.1f} {unit}."
     last = f"with an error of {factor * row['steady_state_error']:.1f} {unit} in the last second"
