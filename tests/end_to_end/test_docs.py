@@ -54,7 +54,7 @@ def test_the_pages_do_link():
     assert sum(len(links(page.read_text(encoding="utf-8"))) for page in DOCS) > 30
 
 
-def test_what_the_readme_says_that_its_command_prints_is_what_it_prints(monkeypatch, capsys, tmp_path):
+def test_what_the_readme_says_that_its_command_prints_is_what_it_prints(no_figures, monkeypatch, capsys, tmp_path):
     sessions = [page for page in PAGES if "```console\n" in page.read_text(encoding="utf-8") and page not in DOCS]
     assert sessions == [PAGES[0]]  # test_first_hour.py carries those of the site out
     assert console.carry_out(PAGES[0].read_text(encoding="utf-8"), monkeypatch, capsys, tmp_path) == 1
@@ -185,7 +185,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
 
 def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2"])
+    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2", "--no-figures"])
     assert made.exit_code == 0, made.output
     (tmp_path / "first").symlink_to("results/latest")
     for code in blocks(read("results.md"), "python"):

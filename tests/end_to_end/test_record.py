@@ -98,7 +98,7 @@ def films(run, tmp_path_factory):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     told = []
     stem = tmp_path_factory.mktemp("films") / "run"
-    paths = film.write_recording(run, stem, film.KINDS, lambda share, what: told.append((share, what)))
+    paths = film.write_recording(stretch(run, 0.0, 0.95), stem, ("mp4", "gif"), lambda *said: told.append(said))
     return paths, told
 
 
@@ -106,16 +106,16 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
     import imageio_ffmpeg
 
     paths, told = films
-    assert [path.name for path in paths] == ["run_snapshots.png", "run_snapshots.pdf", "run.mp4", "run.gif"]
-    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(paths[2]))
-    assert (frames, seconds) == (40, pytest.approx(2.0, abs=0.05))
-    with Image.open(paths[3]) as gif:
-        assert gif.n_frames == 20
+    assert [path.name for path in paths] == ["run.mp4", "run.gif"]
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(paths[0]))
+    assert (frames, seconds) == (20, pytest.approx(1.0, abs=0.05))
+    with Image.open(paths[1]) as gif:
+        assert gif.n_frames == 10
         assert gif.size[0] == encoder.GIF_WIDTH
-    assert paths[3].stat().st_size < 6e6 * 2.0 / 20.0
+    assert paths[1].stat().st_size < 6e6 * 1.0 / 20.0
     shares = [share for share, what in told if what == "frames"]
     assert shares == sorted(shares)
-    assert len(shares) == 40
+    assert len(shares) == 20
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +168,7 @@ def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch
     monkeypatch.setattr(encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
 
     def interrupt(share, what):
-        if share > 0.2:
+        if share > 0.1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -253,13 +253,13 @@ def test_runs_that_cannot_be_shown_are_refused(result):
 def run_on(monkeypatch, folder, text, *arguments):
     """Carry out a short run on a plant of a file, which later commands do not know."""
     write(folder, text, "cell.py")
-    arguments = ("run", "constant", "--plant", "./cell.py", *arguments, "--no-report", "--out", "out")
+    arguments = ("run", "constant", "--plant", "./cell.py", *arguments, "--no-figures", "--out", "out")
     assert servobench(monkeypatch, *arguments) == 0
 
 
 def test_a_run_on_an_own_plant_with_the_arm_is_recorded(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    run_on(monkeypatch, tmp_path, CELL, "--task", "exp2", "--set", "exp2.duration=0.5")
+    run_on(monkeypatch, tmp_path, CELL, "--task", "exp2", "--set", "exp2.duration=0.1")
     (tmp_path / "cell.py").unlink()  # the log is enough
     assert servobench(monkeypatch, "record", "out", "--kinds", "snapshots") == 0, capsys.readouterr().err
     assert (tmp_path / "out" / "recordings" / "Cell-constant-exp2-moderate-0_snapshots.png").stat().st_size > 10_000
