@@ -10,7 +10,7 @@ from PIL import Image
 
 from page_studies.study import FIVE, Study
 from servobench.harness.batch import results
-from servobench.harness.pictures.figures import folder_figures
+from servobench.harness.pictures.figures import Choice, folder_figures
 from servobench.harness.pictures.film import draw_frame
 from servobench.harness.pictures.replay import logged_run
 from servobench.harness.pictures.style import drawing_of
@@ -36,8 +36,7 @@ def readme_pictures(folder: Path) -> dict[str, bytes]:
     frame = draw_frame(logged_run(row, results.load_steps(batch, [row["run_id"]])), PERIOD)
     figures = {
         f"pictures/{FILES[named.kind]}.png": b64decode(drawing_of(named.figure).data)
-        for named in folder_figures(batch)
-        if named.kind in FILES
+        for named in folder_figures(batch, Choice(tuple(FILES)))
     }
     return {"pictures/bench.png": small(Image.fromarray(frame))} | figures
 
