@@ -2,7 +2,7 @@
 
 What a page shows with a prompt is carried out and compared with what it prints. Of the pages of the first hour every
 block is pasted, also those without a prompt, which have to end with exit code 0. `make nightly` carries all out as they
-are written, in a shell; `make test` draws nothing and carries blocks of commands out in this process, with two robots.
+are written, in a shell; `make test` draws nothing and carries blocks of commands out in this process, with one robot.
 """
 
 import os
@@ -77,7 +77,7 @@ class Reader:
         lines = block.replace("\\\n", " ").splitlines()
         if not NIGHTLY and all(line.startswith("servobench ") for line in lines):
             for line in lines:
-                self.call(SEEDS.sub(lambda match: f"--seeds {two_robots(match[1])}", line))
+                self.call(SEEDS.sub(lambda match: f"--seeds {one_robot(match[1])}", line))
             return
         command = ["bash", "-e", "-c", block] if kind == "shell" else [sys.executable, "-c", block]
         made = carried_out(*command, cwd=self.folder, env=self.environment, timeout=3600)
@@ -88,9 +88,9 @@ class Reader:
         assert servobench(self.monkeypatch, *shlex.split(line, comments=True)[1:]) == 0, line
 
 
-def two_robots(first: str | None) -> str:
-    """Return seeds of two robots, from the first one of a range if there is one, such as "100:"."""
-    return f"{first}{int(first[:-1]) + 2}" if first else "2"
+def one_robot(first: str | None) -> str:
+    """Return the seed of one robot, the first one of a range if there is one, such as "100:"."""
+    return f"{first}{int(first[:-1]) + 1}" if first else "1"
 
 
 def lay_out(reader: Reader, text: str) -> None:
