@@ -164,8 +164,6 @@ def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
 def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the runs that have a row, with their place in the table: of many, those that went wrong before others."""
     known = runs.reset_index(drop=True)
-    if len(known) <= SHOWN_RUNS:
-        return known
     wrong = ~comparison.outcomes(known).isin(ACHIEVED)
     return known.loc[wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]].sort_index()
 

@@ -232,9 +232,8 @@ class _Problem:
     def _exposed(self, values: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Return when the frames were exposed, (..., k) s, and the joints behind their gears then, (..., k, n) rad."""
         steady = time = self.time - values["latency"] - values["drift"] * (self.time - self.middle)
-        for _ in range(
-            8 if np.any([values["swing_sin"], values["swing_cos"]]) else 0
-        ):  # the swing is that at the exposure
+        swings = np.any([values["swing_sin"], values["swing_cos"]])
+        for _ in range(8 if swings else 0):  # the swing is that at the exposure
             phase = self.pace * time
             time = steady - values["swing_sin"] * np.sin(phase) - values["swing_cos"] * np.cos(phase)
         ripple, backlash = (np.expand_dims(values[name], -1) for name in ("ripple", "backlash"))
