@@ -194,7 +194,7 @@ def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, 
         ValueError: as `train`.
     """
     lower, upper = config.region(spec.n)
-    sample = lower + (upper - lower) * unit_points(DIGEST_POINTS, spec.n, np.random.default_rng(0))
+    sample = lower + (upper - lower) * np.random.default_rng(0).random((DIGEST_POINTS, spec.n))
     J = _checked(nominal_jacobian, sample, spec)
     content = {
         "config": asdict(config),
