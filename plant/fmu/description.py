@@ -148,7 +148,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
             f"fmu file {path} has the modelIdentifier {_line(repr(identifier))}, which is no name of a library: "
             "wanted letters, digits and '_', without folders"
         )
-    units = {each.name: _unit(each) for each in description.unitDefinitions}
+    units = {each.name: each.baseUnit for each in description.unitDefinitions}
     return FmuDescription(
         path=path,
         root=root,
@@ -224,18 +224,24 @@ def _line(words: object) -> str:
     return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
 
 
-def _unit(unit: Any) -> str:  # noqa: ANN401 - as above
-    """Return the usual name of a unit of length, angle or speed, or such as `0.1 × rad`; else its own name."""
-    base, name = unit.baseUnit, str(unit.name)
+def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as above
+    """Return the usual name of a variable's unit of length, angle or speed, or such as `0.1 × rad`; else its own name.
+
+    The offset of a unit does not apply to a difference (`relativeQuantity`).
+    """
+    kind = variable.declaredType
+    name = str(variable.unit or getattr(kind, "unit", None) or "")
+    base: Any = units.get(name)
+    relative = getattr(kind if variable.relativeQuantity is None else variable, "relativeQuantity", False)
     own = None if base is None else SI_UNITS.get(tuple(getattr(base, each) for each in BASES))
-    if own is None or (base.factor, base.offset) == (1.0, 0.0):
+    if own is None:
         return name
     usual = [each for each, per in UNITS[own].items() if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)]
-    shift = f"{base.offset:g} + " if base.offset else ""
+    shift = f"{base.offset:g} + " if base.offset and not relative else ""
     return f"{shift}{base.factor:g} × {own}" if shift or not usual else usual[0]
 
 
-def _variable(variable: Any, path: Path, units: Mapping[str, str]) -> Variable:  # noqa: ANN401 - as above
+def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable:  # noqa: ANN401 - as above
     name, reference = variable.name, variable.valueReference
     if name is None or not 0 <= reference < 2**32:
         raise ValueError(
@@ -246,8 +252,7 @@ def _variable(variable: Any, path: Path, units: Mapping[str, str]) -> Variable: 
     size = prod(each for _, each in axes)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
-    unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
-    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, units.get(unit, unit))
+    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, _unit(variable, units))
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above

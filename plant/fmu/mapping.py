@@ -127,8 +127,8 @@ class FmuMapping:
         """Check that something takes the start."""
         if self.start is not None and self.joints and self.home is None:
             raise ValueError("start needs home, the parameter that takes it: the FMU has joints of its own")
-        if self.start is not None and self.home in self.parameters:
-            raise ValueError(f"start and parameters.{self.home} both give the joints at the start: leave one out")
+        if self.home in self.parameters:
+            raise ValueError(f"home and parameters name {self.home!r}, the joints at the start: write start instead")
 
 
 def read_mapping(kind: type[Roles], path: Path) -> Roles:

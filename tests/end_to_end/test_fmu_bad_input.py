@@ -14,6 +14,9 @@ TYPES = '<TypeDefinitions><SimpleType name="Rate"><Real unit="deg/s"/></SimpleTy
 IN_DEGREES = describe_with(2, "<ModelVariables>", TYPES).replace('<Real start="0.0"/>', '<Real declaredType="Rate"/>')
 SPEED = '<UnitDefinitions><Unit name="speed"><BaseUnit s="-1" rad="1" factor="{}"/></Unit></UnitDefinitions><TypeD'
 SCALED = IN_DEGREES.replace('"deg/s"', '"speed"').replace("<TypeD", SPEED)
+DIFFERENCE = SCALED.format('0.0174533" offset="3').replace('"speed"/></S', '"speed" relativeQuantity="true"/></S')
+METRES = SPEED.replace('s="-1" rad="1" factor="{}"', 'm="1"').replace("<TypeD", "<ModelV")
+IN_METRES = describe_with(2, "<ModelV", METRES).replace("<Real/>", '<Real unit="speed"/>')
 SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
 
 
@@ -93,6 +96,8 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, mo
         (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
         (2, {"description": IN_DEGREES}, "", "inputs names 'push.slew', whose unit is deg/s; wanted rad/s"),
         (2, {"description": SCALED.format("0.0174533")}, "", "'push.slew', whose unit is deg/s; wanted rad/s: convert"),
+        (2, {"description": DIFFERENCE}, "", "'push.slew', whose unit is deg/s; wanted rad/s: convert"),
+        (2, {"description": IN_METRES}, 'names.feature_unit = "mm"', "must be m, the unit of place.slew, got mm"),
         (2, {"description": SCALED.format("0.1")}, "", "'push.slew', whose unit is 0.1 × rad/s; wanted rad/s: convert"),
         (2, {}, "[parameters]\n'push.slew' = 2\n", "parameters names 'push.slew' as inputs does; each has its own"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),

@@ -61,7 +61,7 @@ def test_every_key_arrives(tmp_path):
         ('file = "crane.fmu"', "", "the key 'file' is missing"),
         ('features = "hook"', "", "the key 'features' is missing"),
         ('home = "q0"', 'hoem = "q0"', r"no setting 'hoem': did you mean 'home'\? valid: camera, debug_log, features"),
-        ("mass = 12", "q0 = 1.0", "start and parameters.q0 both give the joints at the start: leave one out"),
+        ("mass = 12", "q0 = 1.0", "home and parameters name 'q0', the joints at the start: write start instead"),
         ("joint_lower", "joint_low", "limits has no setting 'joint_low': did you mean 'joint_lower'"),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
         ('joints = ["q"]', "joints = [1]", "joints.0 must be text, got 1"),
