@@ -98,7 +98,7 @@ def family_sweep(setup: SetUp, family: str) -> Words:
     size = DEVIATIONS.get(family, 1.0) * setup.pixel
     changes = [
         f"random.duration={DURATION:g}",
-        f'kinematic.sensing.noise="{family}"',
+        *([] if LEVELS[family] else [f'kinematic.sensing.noise="{family}"']),  # an axis that is varied sets it
         f"kinematic.sensing.feature_noise={size:.6g}",
         f"kinematic.sensing.noise_offset={DISPLACED * setup.pixel:g}",
         *(f"{name}.law.proportional_gain={GAIN:g}" for name in names),

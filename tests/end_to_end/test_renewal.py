@@ -2,7 +2,7 @@
 
 import sys
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,10 +22,9 @@ from page_studies import STUDIES, cells, held_out, physical, pictures, worlds
 from page_studies.pictures import README
 from page_studies.study import ENGINES, Study, nothing, sweep
 from servobench.harness.batch import results
-from servobench.harness.batch.plan import TUNING, parse_seeds
+from servobench.harness.batch.plan import TUNING, Batch, SweepPlan, parse_seeds
 from servobench.harness.config.settings import read_settings
-from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import resolve_sections
+from servobench.harness.run.resolution import resolve_sections, select
 from servobench.harness.studies import robustness
 
 TRIED = ("--set", "random.duration=0.5", "--workers", "1")
@@ -164,15 +163,22 @@ def option(words, name, default=""):
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=lambda study: study.name)
-def test_methods_tasks_and_settings_of_the_sweeps_are_known(study):
+def test_methods_tasks_and_settings_of_the_sweeps_are_known_and_fit_each_other(study):
     for words in study.commands.values():
         if callable(words) or words[0] != "sweep":
             continue
-        settings = read_settings(None, [words[i + 1] for i, word in enumerate(words) if word == "--set"])
-        lists = (option(words, f"--{name}").split(",") for name in ("plants", "controllers", "tasks"))
-        requests = [RunRequest(*names, "moderate", 0) for names in product(*lists)]
-        sections = resolve_sections(requests, settings, to_run=False)  # PyBullet need not be installed
-        assert set(settings.sections) <= set(sections)
+        pairs = list(pairwise(words))
+        settings, varied = ([value for name, value in pairs if name == each] for each in ("--set", "--vary"))
+        usual = {"plants": "", "controllers": "", "tasks": "", "mismatch": "moderate"}
+        lists = [tuple(option(words, f"--{name}", value).split(",")) for name, value in usual.items()]
+        seeds = parse_seeds(option(words, "--seeds"))[:1]
+        batch = Batch(*lists, seeds, option(words, "--robot", "ur5"), (option(words, "--sensing", "position"),))
+        varied += [f"{name}={option(words, f'--{name}')}" for name in ("latency", "period") if f"--{name}" in words]
+        requests = [cell.request for cell in SweepPlan.parse(batch, varied).cells()]
+        given = read_settings(None, settings)
+        sections = resolve_sections(requests, given, to_run=False)  # PyBullet need not be installed
+        assert set(given.sections) <= set(sections)
+        assert [select(request, sections) for request in requests]
 
 
 def toy_runs(words):
