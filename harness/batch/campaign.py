@@ -181,7 +181,7 @@ def _carry_out_at(
             how.observer.note(f"note: {folder} holds no runs to continue; all are carried out")
         if resumed:
             restored = restore_manifest(folder, manifest)
-            check_same_batch(folder, manifest, how.observer.note, remedy="name another folder")
+            check_same_batch(folder, manifest, how.observer.note, remedy="give another folder as `out`")
             for line in [restored] * bool(restored) + list(mend(folder, manifest)):  # before anything is computed
                 how.observer.note(f"note: {line}")
         else:

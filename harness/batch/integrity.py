@@ -168,7 +168,7 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
     if owners != {manifest["campaign"]}:
         raise ConfigurationError(
             f"{folder / MANIFEST} {damage.fault}, and the tables are not of this batch or do not say so; "
-            "restore the file from a copy, or name another folder"
+            "restore the file from a copy, or give another folder as `out`"
         ) from damage
     with writing(folder):
         results.write_manifest(folder, manifest)

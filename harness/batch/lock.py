@@ -171,12 +171,12 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     """
     if any("\ud800" <= letter <= "\udfff" for letter in str(folder)):
         encoding = sys.getfilesystemencoding()
-        raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; name another one")
+        raise ConfigurationError(f"results folder {folder}: its name is no {encoding}; give another one as `out`")
     with accessing(folder, "results folder"):
         taken = not is_unused(folder)
     if taken:
-        resume = ", or continue its batch (resume)" if can_resume and folder.is_dir() else ""
-        raise ConfigurationError(f"results folder {folder} exists already; name another one{resume}")
+        resume = ", or continue its batch with `resume`" if can_resume and folder.is_dir() else ""
+        raise ConfigurationError(f"results folder {folder} exists already; give another one as `out`{resume}")
 
 
 def refuse_links(folder: Path) -> None:

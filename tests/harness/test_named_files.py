@@ -58,7 +58,7 @@ def test_a_folder_is_not_resumed_with_another_version_of_a_file(case):
     name = next(iter(files))
     with Path(name).open("a") as file:
         file.write("\n")
-    line = f"^folder was begun with another version of (\\./)?{name}; name another folder, or bring"
+    line = f"^folder was begun with another version of (\\./)?{name}; give another folder as `out`, or bring"
     with pytest.raises(ConfigurationError, match=line):
         servobench.compare(resume=True, **asked)
 

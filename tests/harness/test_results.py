@@ -133,7 +133,7 @@ def test_a_killed_clean_up_loses_nothing(folder):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("", "exists already; name another one"), ("file/out", "cannot be made")]
+    ("name", "message"), [("", "exists already; give another one as `out`"), ("file/out", "cannot be made")]
 )
 def test_a_folder_with_something_in_it_or_that_cannot_be_made_is_refused(tmp_path, name, message):
     (tmp_path / "file").write_text("mine")
