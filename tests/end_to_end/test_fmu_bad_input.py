@@ -97,7 +97,7 @@ def test_validate_loads_an_fmu_without_a_reference_run_and_says_so(output_of, mo
         (2, {"description": IN_DEGREES}, "", "inputs names 'push.slew', whose unit is deg/s; wanted rad/s"),
         (2, {"description": SCALED.format("0.0174533")}, "", "'push.slew', whose unit is deg/s; wanted rad/s: convert"),
         (2, {"description": DIFFERENCE}, "", "'push.slew', whose unit is deg/s; wanted rad/s: convert"),
-        (2, {"description": IN_METRES}, 'names.feature_unit = "mm"', "must be m, the unit of place.slew, got mm"),
+        (2, {"description": IN_METRES}, 'names.feature_unit = "mm"', "must be m, the unit of place.luff, got mm"),
         (2, {"description": SCALED.format("0.1")}, "", "'push.slew', whose unit is 0.1 × rad/s; wanted rad/s: convert"),
         (2, {}, "[parameters]\n'push.slew' = 2\n", "parameters names 'push.slew' as inputs does; each has its own"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
