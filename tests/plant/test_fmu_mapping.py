@@ -1,10 +1,21 @@
 """Mappings of FMU variables in TOML files."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from servobench.plant.fmu.description import FmuDescription, Variable
-from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping, mapping_spec, read_mapping
+from servobench.plant.fmu.mapping import (
+    FmuMapping,
+    JointLimits,
+    LogNames,
+    TruthMapping,
+    mapping_spec,
+    read_mapping,
+    unusual_step,
+)
 
 WHOLE = """
 file = "crane.fmu"
@@ -72,6 +83,7 @@ def test_every_key_arrives(tmp_path):
         ("mass = 12", 'mass = [1, "heavy"]', "parameters.mass must be a number or a list of numbers"),
         ("gains = 3.0", "gains = [1.0, true]", "nominal.gains must be a number or a list of numbers"),
         ("max_joint_speed = 2", "max_joint_speed = -2", "max_joint_speed must be above 0"),
+        ("max_joint_speed = 2", "max_joint_speed = [2.0, 0.0]", "max_joint_speed must be above 0, got .2.0, 0.0."),
         ("[parameters]\nmass = 12\ngains = [1.0, 2.0]", "parameters = 1", "parameters must be a section"),
         ("period = 0.01", "period = ", "is not valid TOML"),
     ],
@@ -87,7 +99,7 @@ def test_a_missing_mapping_is_told(tmp_path):
         read_mapping(FmuMapping, tmp_path / "missing.toml")
 
 
-def spec_of(folder, units=None, **roles):
+def spec_of(folder, units=None, own_step=None, **roles):
     """Return the spec of an FMU with an input, outputs and parameters, of the given units, by a mapping of roles."""
     units = {"v": "rad/s", "q": "rad", "y": "", "q0": "rad", "at": "m", "turned": "rad"} | (units or {})
     causes = dict.fromkeys(units, "output") | {"v": "input", "q0": "parameter"}
@@ -96,6 +108,7 @@ def spec_of(folder, units=None, **roles):
         Variable(name, i, sizes[name], causes[name], unit=unit) for i, (name, unit) in enumerate(units.items())
     ]
     described = FmuDescription(folder / "a.fmu", folder, 2, "a", "a", "", False, False, False, tuple(variables))
+    described = replace(described, internal_step=own_step)
     mapping = FmuMapping(folder / "a.fmu", **{"inputs": ("v",), "features": ("y",), "joints": ("q",)} | roles)
     return mapping_spec(mapping, described, 0.05)
 
@@ -142,11 +155,39 @@ def test_variables_of_the_fmu_in_other_units_are_refused(tmp_path, role, unit, m
         ({"camera": ("at", "y")}, r"a.fmu: camera\[2\] names 'y' as features does"),
         ({"camera": ("q0", "turned")}, r"camera\[1\] must name 3 numbers"),
         ({"inputs": ("q",), "joints": ()}, "inputs names 'q', which is of causality output"),
+        ({"joints": ("q", "y"), "features": ("at",)}, "joints must name 1 numbers for 1 inputs and 3 features, got 2"),
+        (
+            {"limits": JointLimits(joint_lower=np.zeros(2))},
+            r"limits.joint_lower must have one number or 1, got \[0.0, 0.0\]",
+        ),
+        ({"names": LogNames(joints=("a", "b"))}, "names.joints must hold 1 names, got 2"),
+        ({"own_step": 0.02}, "a.fmu takes steps of multiples of 0.02 s only .* must be one, got 0.05 s"),
+        ({"own_step": 0.02, "period": 0.01}, "takes steps of multiples of 0.02 s only .* got 0.01 s"),
     ],
 )
 def test_a_variable_in_two_roles_or_of_the_wrong_size_is_refused(tmp_path, roles, message):
     with pytest.raises(ValueError, match=message):
         spec_of(tmp_path, {"q0": ""}, **roles)
+
+
+def test_steps_of_a_multiple_of_the_own_one_and_names_that_are_not_given_are_taken(tmp_path):
+    spec = spec_of(tmp_path, own_step=0.01, features=("at",), period=0.03)
+    assert (spec.joint_names, spec.feature_names) == (("joint_1",), ("feature_1", "feature_2", "feature_3"))
+
+
+@pytest.mark.parametrize(
+    ("usual", "period", "exchange", "told"),
+    [(0.01, None, False, True), (0.05, None, False, False), (0.06, None, False, False), (None, None, False, False),
+     (0.01, 0.05, False, False), (0.01, None, True, False)],
+)  # fmt: skip
+def test_a_step_longer_than_that_the_fmu_is_meant_for_is_remarked_on(usual, period, exchange, told):
+    names = (Path("a.fmu"), Path(), 2, "a", "a", "", False, False, False, ())
+    described = FmuDescription(*names, usual_step=usual, exchange=exchange)
+    text = unusual_step(FmuMapping(Path("a.fmu"), ("v",), ("y",), period=period), described, 0.05)
+    wanted = (
+        "a.fmu is meant to take steps of 0.01 s and takes those of the control period, 0.05 s; period = 0.01 in the"
+    )
+    assert text.startswith(wanted) if told else not text
 
 
 def test_features_of_two_quantities_with_a_joint_and_outputs_named_twice_are_taken(tmp_path, caplog):
