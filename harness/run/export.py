@@ -80,7 +80,7 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
         recorded = record(controller.servo, lambda servo, given: servo.start(_observation(given)), _step, shapes)
     except NotTraceable as error:
         sensing = resolved.request.sensing
-        where = "" if sensing == DEFAULT_SENSING else f" with --sensing {sensing}, but perhaps with another"
+        where = "" if sensing == DEFAULT_SENSING else f" with the sensing {sensing}"
         raise ConfigurationError(f"{name} has no exported form{where}: {error}") from error
     run = _run(experiment)
     difference = _difference(recorded, run)

@@ -254,7 +254,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "--controller", "ukf_mpc", "-o", "new.fmu"), "controller 'ukf_mpc' has no exported form: it "
      "holds something that is no formula"),
     (("fmu", "export", "--controller", "mfac+rls", "--sensing", "./untraced.py", "-o", "new.fmu"),
-     "untraced.py, but perhaps with another: "),
+     "has no exported form with the sensing ./untraced.py: "),
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
     (("fmu", "export", "--controller", "ukf_mfak", "-o", "new.fmu"), "did you mean 'ukf_mfac'?"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
