@@ -397,17 +397,14 @@ def open_workers(
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
     count = count or min(MAX_DEFAULT_WORKERS, available_processors())
     if scheduler is not None:
-        typed = isinstance(scheduler, str)
-        for name, value in (("run_timeout", bounds.run_timeout), ("run_memory", bounds.run_memory)):
-            if value is not None:
-                option = f"--{name.replace('_', '-')}" if typed else name
-                raise ConfigurationError(f"{option} works with processes of this machine only, not on a cluster")
+        if bounds.run_timeout is not None or bounds.run_memory is not None:
+            raise ConfigurationError("limits of time and memory are for processes of this machine, not for a cluster")
         place = _open_cluster(scheduler) if isinstance(scheduler, str) else contextlib.nullcontext(scheduler)
         try:
             with place as executor:
                 yield _workers_of(executor, count)
         except (BrokenExecutor, CancelledError) as error:
-            again = ", where it has it with --resume," if typed else " with out and resume=True"
+            again = ", where it has it with --resume," if isinstance(scheduler, str) else " with out and resume=True"
             raise ConfigurationError(
                 f"the workers ended: {str(error).rstrip('.') or 'no scheduler answers'}; finished runs are kept, and "
                 f"the same call{again} carries out the others; with processes of this machine, a fatal run is a row"

@@ -29,11 +29,11 @@ from servobench.harness.pictures.style import (
     Styles,
     divisions,
     figure_style,
-    file_name,
     method_styles,
     save_figure,
 )
 from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, longest, shown_until
+from servobench.harness.run.request import UNFIT_FOR_FILES
 
 FOLDER = "figures"
 LETTERS = 15.0  # of a title in an inch
@@ -156,8 +156,8 @@ def _carry_out(group: Group, plan: _Plan, layout: Layout, *, title: bool) -> Nam
         if title:
             wrapped = (textwrap.fill(text, round(LETTERS * figure.get_figwidth())) for text in (heading, details))
             figure.suptitle("\n".join(wrapped), fontsize=TEXT + 1.0)
-    stem = file_name(plan.kind, plan.part, group.plant, group.mismatch)
-    return NamedFigure(plan.kind, stem, f"{heading}: {details}", plan.tasks, figure)
+    words = "_".join(filter(None, (plan.kind, plan.part, group.plant, group.mismatch)))
+    return NamedFigure(plan.kind, UNFIT_FOR_FILES.sub("_", words), f"{heading}: {details}", plan.tasks, figure)
 
 
 def _sample(kind: str, group: Group) -> str:

@@ -306,11 +306,6 @@ def check_tex() -> None:
         )
 
 
-def file_name(*words: str) -> str:
-    """Return words as the name of a file, those that are not empty."""
-    return re.sub(r"[^A-Za-z0-9.=+_-]", "_", "_".join(filter(None, words)))
-
-
 def save_figure(
     figure: Figure, stem: Path, formats: Iterable[str] = FORMATS, *, exact_width: bool = False
 ) -> list[Path]:

@@ -25,6 +25,7 @@ from servobench.harness.batch.plan import Cell as Run
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures import style
 from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.request import UNFIT_FOR_FILES
 from servobench.harness.run.resolution import check_settings, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.challenge import MEASURES, Challenge
@@ -155,8 +156,8 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
                 apart = resolution(own)
-                shown = f"{'less than ' * (apart < 0.0005)}{max(apart, 0.001):.3f}"
-                title += f"; halves of the robots differ by {shown} in the score"
+                less = "less than " * (apart < 0.0005)
+                title += f"; halves of the robots differ by {less}{max(apart, 0.001):.3f} in the score"
             yield title, place.drop(columns="plant")
 
 
@@ -181,7 +182,7 @@ def draw_suite(runs: pd.DataFrame, folder: Path) -> list[Path]:
         top.set_title(f"Runs within a factor of the best, and mean scores, on {runs['plant'].iloc[0]}")
         _draw_scores(bottom, means)
         style.add_legend(figure, [top])
-    return style.save_figure(figure, folder / style.file_name(PICTURE, str(runs["plant"].iloc[0])))
+    return style.save_figure(figure, folder / UNFIT_FOR_FILES.sub("_", f"{PICTURE}_{runs['plant'].iloc[0]}"))
 
 
 def _draw_scores(axes: Axes, means: pd.DataFrame) -> None:

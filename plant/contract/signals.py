@@ -7,7 +7,6 @@ command of instant t_k; the command acts on [t_k, t_{k+1}).
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -45,9 +44,7 @@ class Channel:
     def __post_init__(self) -> None:
         """Check sizes and signs and freeze the arrays."""
         check_number("scale", self.scale, above=0.0)
-        given: object = self.names
-        listed = isinstance(given, Sequence) and not isinstance(given, str)
-        if not listed:
+        if np.ndim(self.names) != 1:
             raise ValueError(f"names of joints and features must be lists, got {self.names!r}")
         for name in ("lower", "upper"):
             bound = np.array(getattr(self, name), dtype=np.float64)

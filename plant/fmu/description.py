@@ -225,19 +225,16 @@ def _line(words: object) -> str:
 
 
 def _unit(variable: Any, units: Mapping[str, Any]) -> str:  # noqa: ANN401 - as above
-    """Return the usual name of a variable's unit of length, angle or speed, or such as `0.1 × rad`; else its own name.
-
-    The offset of a unit does not apply to a difference (`relativeQuantity`).
-    """
+    """Return the usual name of a unit of length, angle or speed, or such as `0.1 × rad`; else the unit's own name."""
     kind = variable.declaredType
-    name = str(variable.unit or getattr(kind, "unit", None) or "")
+    name = variable.unit or getattr(kind, "unit", None) or ""
     base: Any = units.get(name)
     relative = getattr(kind if variable.relativeQuantity is None else variable, "relativeQuantity", False)
     own = None if base is None else SI_UNITS.get(tuple(getattr(base, each) for each in BASES))
     if own is None:
-        return name
+        return str(name)
     usual = [each for each, per in UNITS[own].items() if math.isclose(base.factor * per, 1.0, rel_tol=1e-3)]
-    shift = f"{base.offset:g} + " if base.offset and not relative else ""
+    shift = f"{base.offset:g} + " if base.offset and not relative else ""  # a difference has none
     return f"{shift}{base.factor:g} × {own}" if shift or not usual else usual[0]
 
 

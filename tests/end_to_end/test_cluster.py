@@ -80,8 +80,8 @@ def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_swee
     ("limits", "message"),
     [
         (Bounds(), r"scheduler tcp://127\.0\.0\.1:9 does not answer; start one with"),
-        (Bounds(5.0), "--run-timeout works with processes of this machine only"),
-        (Bounds(run_memory=1e9), "--run-memory works with processes of this machine only"),
+        (Bounds(5.0), "limits of time and memory are for processes of this machine"),
+        (Bounds(run_memory=1e9), "limits of time and memory are for processes of this machine"),
     ],
 )
 def test_a_cluster_that_cannot_be_used_is_refused(limits, message):

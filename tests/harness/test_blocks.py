@@ -77,7 +77,7 @@ def test_any_executor_gives_the_rows_of_this_process(alone, tmp_path, make):
 def test_an_executor_of_threads_or_with_limits_of_runs_is_refused(tmp_path):
     with ThreadPoolExecutor(1) as threads, pytest.raises(ConfigurationError, match="an executor must have processes"):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, threads))
-    with pytest.raises(ConfigurationError, match="^run_timeout works with processes of this machine only"):
+    with pytest.raises(ConfigurationError, match="limits of time and memory are for processes of this machine"):
         carry_out(CAMPAIGN, tmp_path / "out", Execution(1, Here(), Bounds(5.0)))
 
 
