@@ -140,8 +140,7 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    named = with_places(name_twins(folder, runs))
-    for (plant, mismatch), group in named.groupby(["plant", "mismatch"], sort=False):
+    for (plant, mismatch), group in with_places(name_twins(folder, runs)).groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
         for track in load_tracks(folder, chosen):

@@ -155,9 +155,8 @@ def suite_tables(judged: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
             own = bounded(judged[judged["plant"] == plant])
             title = f"ranking on {plant!s} over {own['challenge'].nunique()} of {rows['challenge'].nunique()}"
             if own.groupby("challenge")["seed"].nunique().min() > 1:
-                apart = resolution(own)
-                less = "less than " * (apart < 0.0005)
-                title += f"; halves of the robots differ by {less}{max(apart, 0.001):.3f} in the score"
+                apart = f"{resolution(own):.3f}".replace("0.000", "less than 0.001")
+                title += f"; halves of the robots differ by {apart} in the score"
             yield title, place.drop(columns="plant")
 
 

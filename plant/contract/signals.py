@@ -119,13 +119,9 @@ class PlantSpec:
         if not (limit > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {limit.tolist()}")
         unbounded = np.full(np.size(feature_names), np.inf)
-        return cls(
-            feature=Channel(feature_names, feature_unit, 1.0, -unbounded, unbounded),
-            command=Channel(joint_names, "rad/s", 1.0, -limit, limit),
-            joint_lower=np.asarray(joint_lower),
-            joint_upper=np.asarray(joint_upper),
-            period=period,
-        )
+        feature = Channel(feature_names, feature_unit, 1.0, -unbounded, unbounded)
+        command = Channel(joint_names, "rad/s", 1.0, -limit, limit)
+        return cls(feature, command, np.asarray(joint_lower), np.asarray(joint_upper), period)
 
     @property
     def n(self) -> int:

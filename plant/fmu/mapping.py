@@ -193,15 +193,9 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         check_unit(role, found[role], own_unit, any_quantity=role.endswith(("features", "jacobian")))
         if names and (came := total_size(found[role])) != size:
             raise ValueError(f"{role} must name {size} numbers for {n} inputs and {m} features, got {came}")
-    return PlantSpec.of_joints(
-        _labels("joint", mapping.names.joints, n),
-        _labels("feature", mapping.names.features, m),
-        mapping.limits.of("max_joint_speed", n),
-        mapping.limits.of("joint_lower", n),
-        mapping.limits.of("joint_upper", n),
-        period,
-        mapping.names.feature_unit,
-    )
+    joints, features = _labels("joint", mapping.names.joints, n), _labels("feature", mapping.names.features, m)
+    speed, lower, upper = (mapping.limits.of(name, n) for name in ("max_joint_speed", "joint_lower", "joint_upper"))
+    return PlantSpec.of_joints(joints, features, speed, lower, upper, period, unit)
 
 
 def check_roles(roles: Mapping[str, Iterable[Variable]], inputs: Container[str], description: FmuDescription) -> None:

@@ -164,9 +164,7 @@ class Method:
         checked = runs.checked()
         return TunedValues(
             controller=self.name,
-            robots=runs.robots,
-            offset=runs.offset,
-            plants=runs.plants,
+            **asdict(runs),
             runs_a_trial=len(mine),
             runs_of_second_set=len(on_second),
             date=datetime.now(UTC).date().isoformat(),
