@@ -452,8 +452,8 @@ def _workers_of(executor: Executor, count: int) -> Workers:
         raise ConfigurationError("an executor must have processes: threads would share the state of solvers and files")
     lost: tuple[type[BaseException], ...] = ()
     if (dask := sys.modules.get("distributed")) and isinstance(executor, dask.cfexecutor.ClientExecutor):
-        count, lost = sum(executor._client.nthreads().values()), (dask.KilledWorker,)
-    count = getattr(executor, "_max_workers", count)
+        count, lost = sum(executor._client.nthreads().values()) or count, (dask.KilledWorker,)
+    count = getattr(executor, "_max_workers", None) or count
     return Workers(lambda task, _hear=None: executor.submit(_gather, task), count, cluster=True, lost=lost)
 
 

@@ -322,9 +322,8 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
-    order = np.argsort(WINDING * norm(fit) - clear.gain(clear.arm.frames(fit)) / clear.scale, kind="stable")[
-        :CANDIDATES
-    ]
+    gains = clear.gain(clear.arm.frames(fit)) / clear.scale
+    order = np.argsort(WINDING * norm(fit) - gains, kind="stable")[:CANDIDATES]
     shares = [_find_box(clear, home)[0] for home in fit[order]]
     return np.asarray(fit[order[int(np.argmax(shares))]])
 

@@ -108,6 +108,17 @@ def test_an_executor_that_says_how_many_workers_it_has_gets_work_for_all():
         assert workers.count == 3
 
 
+def test_an_executor_that_has_no_workers_yet_or_does_not_say_how_many_gets_work_for_those_that_are_given():
+    silent = Here()
+    silent._max_workers = None
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    adaptive = distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None)
+    with adaptive, distributed.Client(adaptive) as client:
+        for executor in (silent, client.get_executor()):
+            with open_workers(2, executor) as workers:
+                assert workers.count == 2
+
+
 def _say_twice(_argument, tell):
     tell(time.monotonic())
     time.sleep(0.05)
