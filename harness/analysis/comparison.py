@@ -230,6 +230,7 @@ def _sample(values: ArrayLike) -> FloatArray:
     return np.where(np.isnan(sample), np.inf, sample)
 
 
+FROM_TWIN: Final = "drawn from the twin"  # in titles, the mismatch none of such robots
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
 CONDITION: Final = ("plant", "sensing", "task", "mismatch")  # with the settings that are varied
 HANDY_UNITS: Final = {"m": ("mm", 1000.0)}

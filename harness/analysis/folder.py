@@ -9,7 +9,7 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.controllers.aids import describe_aids
-from servobench.harness.analysis.comparison import shown_value
+from servobench.harness.analysis.comparison import FROM_TWIN, shown_value
 from servobench.harness.analysis.tables import PAIR, Tables
 from servobench.harness.batch import results
 from servobench.harness.config.registry import MAPPED
@@ -43,7 +43,7 @@ def name_twins(folder: Path, runs: pd.DataFrame) -> pd.DataFrame:
     """Return a folder's runs for titles: the mismatch of robots that were drawn from a twin, which is none, says so."""
     robots = results.read_manifest(folder).get("robots") or ()
     drawn = any(str(each.get("title")).endswith(" twin") for each in robots)
-    return runs.replace({"mismatch": {"none": "drawn from the twin"}}) if drawn else runs
+    return runs.replace({"mismatch": {"none": FROM_TWIN}}) if drawn else runs
 
 
 def describe_controllers(folder: Path) -> str:

@@ -332,7 +332,7 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
         if is_numeric_dtype(runs[name]) and any(own[name].nunique() > 1 for own in places)
     }
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
-        none = runs[runs["mismatch"] == "none"].assign(size=0.0)
+        none = runs[runs["mismatch"].isin(["none", comparison.FROM_TWIN])].assign(size=0.0)
         runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
     along = runs[runs["axis"].fillna("") != ""]
     along = along.assign(size=along["magnitude"].astype(float))

@@ -14,7 +14,7 @@ from PIL import Image
 
 from kit.command import servobench
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
-from servobench.harness.analysis.comparison import split_tasks
+from servobench.harness.analysis.comparison import FROM_TWIN, split_tasks
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures import style
@@ -237,6 +237,9 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))
     assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
+    late, drawn = moves.assign(mismatch="jitter=50ms"), moves.assign(mismatch=FROM_TWIN)
+    line = draw_conditions(pd.concat([drawn, late]), method_styles(CONTROLLERS)).axes[0].get_lines()[0]
+    assert line.get_xdata().tolist() == [0.0, 50.0]
 
 
 def test_noise_that_is_crossed_with_an_axis_has_a_panel_and_noise_that_is_the_axis_none_of_its_own(tmp_path):
