@@ -387,7 +387,7 @@ def open_workers(
         controllers: names of the controllers.
         own: controllers and plants that users gave.
         trusted: names of FMUs that may share a process with the code of this package.
-        steps: whether runs return their tables of steps, for which workers import pandas once.
+        steps: whether runs return their tables of steps, for which workers import pandas once, as for code of users.
 
     Raises:
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, a limit is asked
@@ -416,7 +416,7 @@ def open_workers(
     if count == 1 and limits == Limits():
         yield Workers()
         return
-    pool = Pool(count, limits, (*MODULES, *["pandas"] * steps, *own_modules(plants, controllers)))
+    pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *own_modules(plants, controllers)))
     try:
         yield Workers(pool.submit, count)
     finally:

@@ -14,9 +14,11 @@ import psutil
 import pytest
 
 from kit.command import left_behind, python, start, wait_for
+from kit.forked import say_modules
 from kit.nightly import some
 from servobench.harness.batch import sandbox
-from servobench.harness.batch.processes import Limits
+from servobench.harness.batch.blocks import open_workers
+from servobench.harness.batch.processes import Bounds, Limits
 from servobench.harness.batch.sandbox import Pool, Task
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -231,3 +233,9 @@ def test_of_a_guard_that_is_stopped_again_and_again_nothing_stays(monkeypatch):
     assert ended is not None
     assert ended.status == "timed_out"
     wait_for(lambda: has_ended(told[0]), 5.0)
+
+
+@pytest.mark.parametrize(("name", "wanted"), [("constant", ["numpy.ma"]), ("fmu:pilot.fmu", ["pandas", "numpy.ma"])])
+def test_pandas_is_imported_once_and_beyond_the_limit_of_memory_where_code_of_others_runs(name, wanted):
+    with open_workers(2, bounds=Bounds(run_memory=150e6), controllers=[name]) as workers:
+        assert workers.submit(Task(say_modules, pickle.dumps(None))).result().items == [wanted]
