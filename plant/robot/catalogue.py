@@ -24,7 +24,7 @@ from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.twin import read_twin
-from servobench.plant.robot.workspace import find_workspace, with_ball
+from servobench.plant.robot.workspace import search_workspace, with_ball
 
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
     title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
@@ -134,12 +134,10 @@ def random_robot(number: int) -> Robot:
     for _ in range(MAX_DRAWS):
         arm = _draw_arm(n, generator)
         links = estimate_links(arm, None, None)
-        try:
-            workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
-        except ValueError:
-            continue
-        source = f"drawn from the number {number}"
-        return Robot(name, name, source, arm, limits, links, workspace, note=f"{name} has {n} joints", known=False)
+        workspace = search_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        if workspace is not None:
+            source, note = f"drawn from the number {number}", f"{name} has {n} joints"
+            return Robot(name, name, source, arm, limits, links, workspace, note=note, known=False)
     raise ValueError(f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number")
 
 

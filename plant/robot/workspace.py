@@ -58,9 +58,7 @@ class Workspace:
         shapes = {"centre": 3, "shoulder": 3, **dict.fromkeys(("home", "lower", "upper", "stretched"), n)}
         for name, size in shapes.items():
             object.__setattr__(self, name, as_vector(name, getattr(self, name), size))
-        moves = {
-            name: (as_vector(name, start, n), as_vector(name, end, n)) for name, (start, end) in self.moves.items()
-        }
+        moves = {name: tuple(as_vector(name, end, n) for end in ends) for name, ends in self.moves.items()}
         object.__setattr__(self, "moves", moves)
 
     @property
@@ -91,6 +89,7 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
     return pose
 
 
+Found = tuple[float, Callable[[], Workspace]]
 HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
 OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
@@ -254,42 +253,47 @@ def with_ball(arm: SerialArm) -> SerialArm:
 
 
 def find_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace:
-    """Return the workspace of an arm.
+    """Return the workspace of an arm, as `search_workspace`.
+
+    Raises:
+        ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
+    """
+    if (found := search_workspace(arm, limits, shapes)) is not None:
+        return found
+    if arm.n < 3 or length_scale(arm) == 0.0:
+        size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
+        raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
+    look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
+    shift = arm.translation[0]
+    heights = (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4)))
+    moved = [np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()]
+    if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
+        look = "its joint limits, which forbid all of them"
+    elif any(_at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None for each in moved):
+        place = ", ".join(f"{each:g}" for each in shift)
+        look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
+    wanted = "in which its ball is over the table, in view of the camera and free of contact"
+    raise ValueError(f"the arm has no posture {wanted}; look at {look}")
+
+
+def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | None:
+    """Return the workspace of an arm, None where no posture is fit to work in.
 
     Args:
         arm: the nominal arm with its ball.
         limits: lower and upper joint positions, (n,) and (n,) rad.
         shapes: radius of each link's tube and how far it lies aside, (n,) and (n,) m.
-
-    Raises:
-        ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
     """
-    if arm.n < 3 or length_scale(arm) == 0.0:
-        size = f"{arm.n} joints and links of {LENGTH_OF_UR5 * length_scale(arm):g} m in all"
-        raise ValueError(f"an arm has three joints or more and links with lengths, got {size}")
-    found = [_at_height(arm, limits, shapes, HEIGHTS[0])]
-    for height in HEIGHTS[1:]:
-        if found[-1] is None or found[-1][0] < ENOUGH * 0.8:
-            found.append(_at_height(arm, limits, shapes, height))
-    fit = [each for each in found if each is not None]
-    if not fit:
-        look = "order, units and signs of its lengths and twists (a, d, alpha), or the origins of a URDF"
-        shift = arm.translation[0]
-        heights = (shift[2], *(length_scale(arm) * np.linspace(0.0, 0.45, 4)))
-        moved = [np.vstack([(0.0, 0.0, height), arm.translation[1:]]) for height in heights if shift.any()]
-        if _at_height(arm, (np.full(arm.n, -np.pi), np.full(arm.n, np.pi)), shapes, HEIGHTS[-1]) is not None:
-            look = "its joint limits, which forbid all of them"
-        elif any(_at_height(replace(arm, translation=each), limits, shapes, HEIGHTS[0]) is not None for each in moved):
-            place = ", ".join(f"{each:g}" for each in shift)
-            look = f"its first joint, which is at ({place}) m; the bench is around an arm at (0, 0, 0)"
-        wanted = "in which its ball is over the table, in view of the camera and free of contact"
-        raise ValueError(f"the arm has no posture {wanted}; look at {look}")
-    return max(fit, key=lambda each: each[0])[1]()
+    best = None
+    for height in HEIGHTS if arm.n >= 3 and length_scale(arm) > 0.0 else ():
+        found = _at_height(arm, limits, shapes, height)
+        best = max(filter(None, (best, found)), key=lambda each: each[0], default=None)
+        if found is not None and found[0] >= ENOUGH * 0.8:
+            break
+    return best and best[1]()
 
 
-def _at_height(
-    arm: SerialArm, limits: Pair, shapes: Pair, height: float
-) -> tuple[float, Callable[[], Workspace]] | None:
+def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Found | None:
     """Return the fit share of the box at a height and what makes its workspace; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
@@ -322,16 +326,14 @@ def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> Flo
     fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
     if not len(fit):
         return None
-    gains = clear.gain(clear.arm.frames(fit)) / clear.scale
-    order = np.argsort(WINDING * norm(fit) - gains, kind="stable")[:CANDIDATES]
-    shares = [_find_box(clear, home)[0] for home in fit[order]]
-    return np.asarray(fit[order[int(np.argmax(shares))]])
+    cost = WINDING * norm(fit) - clear.gain(clear.arm.frames(fit)) / clear.scale
+    homes = fit[np.argsort(cost, kind="stable")[:CANDIDATES]]
+    return np.asarray(max(homes, key=lambda home: _find_box(clear, home)[0]))
 
 
 def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, Pair]:
     """Return the largest box around a home with enough fit postures, and their share."""
-    half = np.full(clear.arm.n, HALF_BOX)
-    half[-1] = LAST_HALF
+    half = np.append(np.full(clear.arm.n - 1, HALF_BOX), LAST_HALF)
     unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
     best = 0.0, (home - SHRINK[-1] * half, home + SHRINK[-1] * half)
     for shrink in SHRINK:
