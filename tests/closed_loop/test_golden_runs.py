@@ -1,6 +1,5 @@
 """Methods still do what they did, to ten times what rounding does, at night all on every plant; see `kit.golden`."""
 
-import os
 import platform
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import pytest
 
 from kit import golden
 from kit.nightly import some
-from kit.plants import plant_parameters
+from kit.plants import NEEDS, plant_parameters
 from servobench.harness.config.registry import CONTROLLERS, RENDERED, engine_of
 
 CHANGELOG = Path(__file__).parents[2] / "CHANGELOG.md"
@@ -26,15 +25,23 @@ def deviations(found, stored):
     return commands / stored["spread"].to_numpy(), late / golden.PERIOD
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The runs on all plants that are here, made in one process with the networks of one folder."""
+    here = [plant for plant in golden.DURATIONS if plant not in NEEDS or not NEEDS[plant].args[0]]
+    names = {plant: CONTROLLERS if plant == "kinematic" else ELSEWHERE for plant in here}
+    return golden.made_apart(tmp_path_factory.mktemp("golden"), names)
+
+
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the table is of a kernel of OpenBLAS for x86-64")
 @pytest.mark.parametrize("plant", plant_parameters(golden.DURATIONS))
-def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant, tmp_path):
+def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant, made):
     if plant == "mujoco" and golden.RENDERER not in engine_of(plant):
         pytest.skip(f"the images of the table are of {golden.RENDERER}, and those here of {engine_of(plant)}")
-    cache = {"XDG_CACHE_HOME": str(Path(os.environ["XDG_CACHE_HOME"]) / "golden")}  # for all plants
-    names = CONTROLLERS if plant == "kinematic" else ELSEWHERE
-    found, stored = golden.made_apart(tmp_path, [plant], names, **cache), golden.stored()
-    stored = stored[(stored["plant"] == plant) & stored["controller"].isin(names)].reset_index(drop=True)
+    found, stored = (each[each["plant"] == plant].reset_index(drop=True) for each in (made, golden.stored()))
+    stored = stored[stored["controller"].isin(CONTROLLERS if plant == "kinematic" else ELSEWHERE)].reset_index(
+        drop=True
+    )
     assert found["controller"].tolist() == stored["controller"].tolist(), RENEW
     commands, settled = deviations(found, stored)
     changed = found["controller"][(commands > MARGIN) | (settled > 1.0 + 1e-9)].tolist()

@@ -28,6 +28,7 @@ PERIODS = 20  # that are compared
 PERIOD = 0.05  # [s]
 TASK = "exp2"
 DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}  # [s], short where rendered
+EVERY = dict.fromkeys(DURATIONS, CONTROLLERS)  # methods by plant
 RENDERER = "llvmpipe"  # that drew the images of `mujoco`; those of another one differ by more than rounding
 MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
 TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
@@ -75,14 +76,13 @@ def changelog_line() -> str:
     return f"Golden runs: `{hashlib.sha256(TABLE.read_bytes()).hexdigest()[:16]}`."
 
 
-def made_apart(
-    folder: Path, plants: Iterable[str] = DURATIONS, controllers: Iterable[str] = CONTROLLERS, **environment: str
-) -> pd.DataFrame:
-    """Return the table as a process of its own makes it; the first one in a folder trains networks."""
+def made_apart(folder: Path, controllers: Mapping[str, Iterable[str]] = EVERY, **environment: str) -> pd.DataFrame:
+    """Return the table as a process of its own makes it, by the plants; the first one in a folder trains networks."""
     folder.mkdir(exist_ok=True)
     path = folder / "made.csv"
     own = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), **KERNEL, **environment}
-    subprocess.run([sys.executable, __file__, str(path), ",".join(controllers), *plants], env=own, check=True)
+    runs = [f"{plant}={','.join(names)}" for plant, names in controllers.items()]
+    subprocess.run([sys.executable, __file__, str(path), *runs], env=own, check=True)
     return pd.read_csv(path)
 
 
@@ -106,7 +106,8 @@ def renew() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        path, controllers, *plants = sys.argv[1:]
-        pd.concat([golden_runs(plant, controllers.split(",")) for plant in plants]).to_csv(path, index=False)
+        path, *runs = sys.argv[1:]
+        wanted = [each.partition("=") for each in runs]
+        pd.concat([golden_runs(plant, names.split(",")) for plant, _, names in wanted]).to_csv(path, index=False)
     else:
         renew()
