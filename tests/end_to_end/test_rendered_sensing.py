@@ -50,12 +50,12 @@ def test_with_noise_the_centre_has_no_bias_of_note(open_scene, model):
     errors, _ = errors_over_poses(open_scene, RenderedConfig(depth_noise=model), 100)
     assert np.abs(errors.mean(axis=0)).max() < 0.0006
     assert np.linalg.norm(errors, axis=1).max() < 0.015
+    if model == RenderedConfig().depth_noise:  # more than the noise of `kinematic`
+        assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
 
 
-def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic(open_scene):
-    errors, _ = errors_over_poses(open_scene, RenderedConfig(), 100)
-    assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
-    white, _ = errors_over_poses(open_scene, RenderedConfig(depth_patch=0.0), 100)
+def test_stereo_noise_without_patches_moves_the_centre_by_less_than_the_noise_of_kinematic(open_scene):
+    white, _ = errors_over_poses(open_scene, RenderedConfig(depth_patch=0.0), 50)
     assert (white.std(axis=0) < 0.001).all()
 
 
@@ -101,7 +101,7 @@ def poses(scene, depth_camera, count):
 def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_ball(open_scene):
     scene, seen = open_scene(scenery=True, boxes=BOXED.boxes()), 0
     depth_camera = DepthCamera(scene, BARE, PinholeCamera(), BALL_RADIUS)
-    for X_BC, window in poses(scene, depth_camera, 30):
+    for X_BC, window in poses(scene, depth_camera, 20):
         images = scene.render(depth_camera.camera, X_BC)
         patch = find_patch(images[0])
         if window is None:
@@ -114,14 +114,14 @@ def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_bal
             margins = patch.rows.min() - window.top, patch.columns.min() - window.left
             margins += window.bottom - 1 - patch.rows.max(), window.right - 1 - patch.columns.max()
             assert all(MARGIN <= margin <= MARGIN + 3 for margin in margins) or len(patch.rows) < 50
-    assert 5 < seen < 30
+    assert 5 < seen < 20
 
 
 def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeypatch):
     scene, camera, found = open_scene(scenery=False), PinholeCamera(), 0
     depth_camera = DepthCamera(scene, BARE, camera, BALL_RADIUS)
     noise, again = begin_noise(3), begin_noise(3)
-    for X_BC, _ in poses(scene, depth_camera, 30):
+    for X_BC, _ in poses(scene, depth_camera, 20):
         one = depth_camera.find(X_BC, scene.ball_position(), noise)
         with monkeypatch.context() as patched:
             patched.setattr(detectors, "window_around", lambda *_: whole(camera))
@@ -132,7 +132,7 @@ def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeyp
             np.testing.assert_array_equal(one.centre, other.centre)
         states = [[part.bit_generator.state for part in each.values()] for each in (noise, again)]
         assert states[0] == states[1]
-    assert 5 < found < 30
+    assert 5 < found < 20
 
 
 def test_nothing_in_a_room_but_the_ball_has_its_colour(open_scene):

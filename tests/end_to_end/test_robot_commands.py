@@ -15,7 +15,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 
-SHORT = Settings({"exp2": {"duration": 3.0}})
+SHORT = Settings({"exp2": {"duration": 3.0}, "bullet": {"scenery": False}})
 
 
 @pytest.fixture
