@@ -1,6 +1,7 @@
 """The answers to the paper's claims: the rules on tables with a known outcome, and the command on real runs."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -268,6 +269,7 @@ def brief_studies(*arguments):
 def test_the_command_answers_from_real_runs_and_says_the_same_again(output_of, monkeypatch, tmp_path):
     monkeypatch.setattr(claims, "TIMED_ROBOTS", 1)
     monkeypatch.setattr(reproduction, "studies", brief_studies)
+    monkeypatch.setattr(reproduction, "save_figure", partial(reproduction.save_figure, formats=["png"]))
     short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1", "--division", "equipped")
     shown = output_of(*short, "--out", tmp_path / "first")
     assert "1: converges faster than the other three on kinematic, best equipped" in shown
