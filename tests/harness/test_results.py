@@ -247,6 +247,8 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
         write_atomically(path, fail)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(OSError, match="Not a directory"):
+        write_atomically(path / "page", lambda _: pytest.fail("its content is made although it cannot be kept"))
 
 
 def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
