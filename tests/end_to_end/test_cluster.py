@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import pandas as pd
 import pytest
@@ -16,7 +17,7 @@ from servobench.harness.batch.blocks import open_workers
 from servobench.harness.batch.processes import Bounds
 from servobench.plant.contract.faults import ConfigurationError
 
-pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="the extra 'cluster' is not installed")
 
 SEEDS = ("--seeds", "30", "--set", "random.duration=3")
 RUNS = 120  # the first block is there long before the last

@@ -3,7 +3,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from trimesh.creation import icosphere
 
 from kit.plants import configure, factory_ur5, odd_ur5, setup
 from servobench.plant.rendered.plants import BULLET
@@ -136,6 +135,8 @@ def read_obj(text) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_sphere_is_closed_round_and_turned_outwards():
     vertices, triangles = read_obj(sphere_obj(3))
+    from trimesh.creation import icosphere
+
     same = icosphere(3)
     assert (vertices == same.vertices).all()
     assert (triangles == same.faces).all()
