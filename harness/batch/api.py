@@ -122,7 +122,7 @@ def compare(
         sensings: see `run`.
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
-        workers: number of processes; an `executor` may say its own.
+        workers: number of processes, unless an `executor` tells its own.
         executor: of `concurrent.futures`, which carries the runs out in processes of its own, also on other machines:
             a `ProcessPoolExecutor`, `MPIPoolExecutor` of mpi4py, or `client.get_executor(pure=False)` of Dask.
         run_timeout: [s] time limit of a run; None for the usual one, if any.

@@ -404,10 +404,10 @@ def open_workers(
             with place as executor:
                 yield _workers_of(executor, count)
         except (BrokenExecutor, CancelledError) as error:
-            again = ", where it has it with --resume," if isinstance(scheduler, str) else " with out and resume=True"
+            again = " with --resume (if it has it)" if isinstance(scheduler, str) else " with out and resume=True"
             raise ConfigurationError(
                 f"the workers ended: {str(error).rstrip('.') or 'no scheduler answers'}; finished runs are kept, and "
-                f"the same call{again} carries out the others; with processes of this machine, a fatal run is a row"
+                f"the same call{again} carries out the others; on this machine a run that kills its process is a row"
             ) from error
         return
     foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)

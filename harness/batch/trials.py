@@ -74,7 +74,7 @@ def attempt(
     Raises:
         ConfigurationError: that of the function.
     """
-    from servobench.harness.batch import processes, sandbox  # noqa: PLC0415 - lists of what is our own need none
+    from servobench.harness.batch import processes, sandbox  # noqa: PLC0415 - lists of our own items need neither
 
     found: dict[str, Any] = {}
 

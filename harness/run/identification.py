@@ -206,7 +206,7 @@ class _Problem:
         self.nominal = np.asarray(model.camera)
         self._of_camera = np.array([name.startswith("camera") for name in self.names])
         self.model, self.pace, model = model, 1.0, deviated(model, begin)
-        self._last: Any = None  # z, pace and model of the last errors
+        self._last: tuple[Any, Any] = None, None  # z, pace and model of the last errors, and values computed for them
         latencies = np.arange(0.0, MAX_LATENCY + 1e-9, LATENCY_STEP)
         self.spread, latency, turning, pose = self._placed(model, latencies, np.zeros_like(latencies))
         if not pixels:
@@ -252,14 +252,14 @@ class _Problem:
         values = self.values(z)
         (time, q), model = self._exposed(values), deviated(self.model, values)
         frames = model.arm.frames(q)
-        self._last, self._kept = (z.tobytes(), self.pace, self.model), (values, time, q, model, frames)
+        self._last = (z.tobytes(), self.pace, self.model), (values, time, q, model, frames)
         return np.asarray(self.y - self._seen(model, values, time, model.arm.ball(frames)))
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Return ∂(y − h)/∂z, (p, k, m): of arm and camera by the chain rule, of others by differences."""
-        if self._last != (z.tobytes(), self.pace, self.model):
+        if self._last[0] != (z.tobytes(), self.pace, self.model):
             self.errors(z)
-        values, time, q, model, frames = self._kept
+        values, time, q, model, frames = self._last[1]
         ball, motions = ball_rates(self.model, model.arm, q, frames)
         by_joint = np.stack([motions.pop(name) for name in self.model.arm.joint_names], axis=-1)
         seen = self._seen(model, values, time, ball)

@@ -30,7 +30,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """
     partial = partial_path(path)
     try:
-        partial.touch()  # what takes no file is refused before its content is made
+        partial.touch()  # a place without room for a file is refused before the content is made
         write(partial)
         sync(partial)
         partial.replace(path)

@@ -28,7 +28,7 @@ PERIODS = 20  # that are compared
 PERIOD = 0.05  # [s]
 TASK = "exp2"
 DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}  # [s], short where rendered
-EVERY = dict.fromkeys(DURATIONS, CONTROLLERS)  # methods by plant
+ALL_RUNS = dict.fromkeys(DURATIONS, CONTROLLERS)  # methods by plant
 RENDERER = "llvmpipe"  # that drew the images of `mujoco`; those of another one differ by more than rounding
 MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
 TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
@@ -76,7 +76,7 @@ def changelog_line() -> str:
     return f"Golden runs: `{hashlib.sha256(TABLE.read_bytes()).hexdigest()[:16]}`."
 
 
-def made_apart(folder: Path, controllers: Mapping[str, Iterable[str]] = EVERY, **environment: str) -> pd.DataFrame:
+def made_apart(folder: Path, controllers: Mapping[str, Iterable[str]] = ALL_RUNS, **environment: str) -> pd.DataFrame:
     """Return the table as a process of its own makes it, by the plants; the first one in a folder trains networks."""
     folder.mkdir(exist_ok=True)
     path = folder / "made.csv"
