@@ -48,7 +48,7 @@ from servobench.plant.contract.signals import BoolArray
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
 LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
-CACHED: Final = 16  # runs side by side whose filters fit into the cache of a processor
+CACHED: Final = 32  # runs side by side that learn in one piece: more would all wait for one that moves
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
 MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
@@ -117,10 +117,10 @@ def learn(
         walk: variance that the columns of W gain during the motion, (..., N, K−1).
         learns: (..., N or 1), whether W is learned; otherwise it is considered only.
     """
-    m = feature_step.shape[-1]
+    m, regressors = feature_step.shape[-1], h
     h = np.concatenate([h, np.full((*h.shape[:-1], 1), -1.0)], axis=-1)
     known = np.matvec(bank, h)
-    known[..., m:-1] += walk * h[..., :-1]
+    known[..., m:-1] += walk * regressors
     Ph = known[..., m:]
     s = frame[..., None] + model + np.vecdot(h, Ph)
     known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
@@ -128,17 +128,16 @@ def learn(
     capped = np.maximum(s, square / GATE)
     noise = frame[..., None] + (capped - s)
     share = noise / capped
-    gain = Ph / capped[..., None]
-    gain[..., :-1] *= learns[..., None]
+    gain = Ph / np.where(learns, capped, np.inf)[..., None]  # its last column is not used
     frames = 1.0 + np.minimum(bank[..., -1, -1] / frame[..., None], 1.0)
-    learned, noisy, own = np.empty(bank.shape), -share[..., None] * known, noise * (1.0 - share)
+    learned, noisy = np.empty(bank.shape), -share[..., None] * known
+    noisy[..., -1] = noise * (1.0 - share)
     for part in _parts(bank):
         new, some = learned[part], np.logical_or.reduce(learns[part].reshape(-1), axis=-1)
         new[...] = branch(some, _corrected, bank[part], known[part], gain[part])
         diagonal = new.reshape(*new.shape[:-2], -1)[..., m * h.shape[-1] :: h.shape[-1] + 1]
         diagonal[..., :-1] += walk[part]
         new[..., -1], new[..., -1, :-1] = noisy[part], noisy[part][..., m:-1]
-        new[..., -1, -1] = own[part]
     return learned, Innovation(-known[..., :m], square, s, capped, frames)
 
 
