@@ -245,12 +245,13 @@ def load_runs(folder: Path) -> pd.DataFrame:
         ConfigurationError: not a results folder, one of another schema, a file of it is damaged, or the
             table lacks a column that says which run a row is, or a run's identifier is unfit for the name of a file.
     """
-    check_folder(folder)
-    names = _intact(folder, RUNS)
+    manifest, names = check_folder(folder), _intact(folder, RUNS)
     runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
-    runs = runs.astype({name: float for name in tables.MOST if name in runs and runs[name].dtype == object})
-    period = (read_manifest(folder).get("changed") or {}).get("run.period")
+    for name, kind in runs.dtypes.items():
+        if name in tables.NUMBERS and kind.kind == "O":
+            runs[name] = runs[name].astype(float)
+    period = (manifest.get("changed") or {}).get("run.period")
     if isinstance(period, float):  # of all runs whose period no sweep varies
         runs["period_s"] = runs["period_s"].fillna(period) if "period_s" in runs else period
     refuse_nameless(folder / names[0], runs)
@@ -340,16 +341,17 @@ def check_steps(folder: Path) -> None:
         raise ConfigurationError(f"{folder} holds no steps: a sweep keeps none; use run or compare")
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder without results of this schema.
+def check_folder(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a folder with results of this schema.
 
     Raises:
-        ConfigurationError: names the missing file or the other schema.
+        ConfigurationError: there are none; names the missing file or the other schema.
     """
-    read_manifest(folder)
+    manifest = read_manifest(folder)
     if not (folder / RUNS).is_file() and not part_indices(folder):
         _refuse_damaged(folder, [RUNS] if is_expected(folder, RUNS) else [])
         raise ConfigurationError(f"{folder} holds no finished run")
+    return manifest
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

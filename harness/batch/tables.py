@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
@@ -101,15 +102,17 @@ def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
 def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
     """Write tables as one, holding few rows in memory; the columns that a table lacks are null."""
     schema = common_schema(folder, names).with_metadata({BATCH: batch} if batch else None)
-    waiting = schema.empty_table()
+    none, rows = schema.empty_table(), 0
+    waiting = [none]
     with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
         for name in names:
             with opened(folder, name) as part:  # threads and datasets would hold memory that grows with the parts
                 table = part.read(use_threads=False).replace_schema_metadata()
-                waiting = pa.concat_tables([waiting, table], promote_options="permissive")
-            if len(waiting) >= ROW_GROUP or (name == names[-1] and len(waiting)):
-                writer.write_table(waiting.replace_schema_metadata(schema.metadata))
-                waiting = schema.empty_table()
+                waiting.append(pa.concat_tables([none, table], promote_options="permissive"))
+            rows += len(table)
+            if rows >= ROW_GROUP or (name == names[-1] and rows):
+                writer.write_table(pa.concat_tables(waiting).replace_schema_metadata(schema.metadata))
+                waiting, rows = [none], 0
 
 
 def read_tables(
@@ -288,12 +291,14 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     Raises:
         ConfigurationError: names the table, the column and the row.
     """
-    for name in NEEDED["runs"]:
-        if (empty := runs[name].isna()).any():
-            raise ConfigurationError(f"{path} is no table of runs: row {int(empty.to_numpy().argmax())} has no {name}")
-    for name in NUMBERS.intersection(runs.columns):
-        if len(wrong := runs[name][(runs[name] < 0.0) | (runs[name] > MOST[name])]):
-            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number {wrong.iloc[0]:g}")
+    empty = runs[list(NEEDED["runs"])].isna().to_numpy()
+    for row, name in np.argwhere(empty)[:1]:
+        raise ConfigurationError(f"{path} is no table of runs: row {row} has no {NEEDED['runs'][name]}")
+    numbers = [name for name in MOST if name in runs]
+    for name, least, most in zip(numbers, runs[numbers].min(), runs[numbers].max(), strict=True):
+        if least < 0.0 or most > MOST[name]:
+            wrong = least if least < 0.0 else most
+            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number {wrong:g}")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(
