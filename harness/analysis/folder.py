@@ -120,12 +120,13 @@ def _table(title: str, rows: pd.DataFrame) -> str:
     letters = sum(rows[name].str.len().max() for name in rows)
     kind = "table" if letters <= ONE_COLUMN else "table*"
     sides = "".join("r" if rows[name].str.match(NUMBER).all() else "l" for name in rows)
+    cells = rows.map(lambda text: INTERVAL.sub(r" {\\scriptsize \1}", MINUS.sub("$-$", text.translate(SIGNS))))
     lines = [
         rf"\begin{{{kind}}}\centering\footnotesize\setlength{{\tabcolsep}}{{4pt}}",
         rf"\caption{{{title.translate(SIGNS)}}}",
         rf"\begin{{tabular}}{{@{{}}{sides}@{{}}}}\toprule",
         rf"{' & '.join(map(_heading, rows.columns, sides))} \\\midrule",
-        *(rf"{' & '.join(map(_cell, row))} \\" for row in rows.itertuples(index=False)),
+        *(rf"{' & '.join(row)} \\" for row in cells.itertuples(index=False)),
         rf"\bottomrule\end{{tabular}}\end{{{kind}}}",
     ]
     return "\n".join(lines)
@@ -136,10 +137,6 @@ def _heading(name: str, side: str) -> str:
     lines = textwrap.wrap(words.replace(" %", "\u00a0%"), HEADING) + [f"[{unit}"] * bool(unit)
     text = r"\\{}".join(line.translate(SIGNS) for line in lines)
     return rf"\begin{{tabular}}[b]{{@{{}}{side}@{{}}}}{text}\end{{tabular}}"
-
-
-def _cell(text: str) -> str:
-    return INTERVAL.sub(r" {\\scriptsize \1}", MINUS.sub("$-$", text.translate(SIGNS)))
 
 
 def methods_paragraph(folder: Path, runs: pd.DataFrame) -> str:

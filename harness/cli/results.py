@@ -42,7 +42,7 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import latex_tables, methods_paragraph, name_twins
+    from servobench.harness.analysis.folder import describe_controllers, latex_tables, methods_paragraph, name_twins
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
@@ -64,7 +64,7 @@ def statistics(
         say("\n\n".join([*latex_tables(tables), methods_paragraph(folder, runs)]))
         return
     print_markdown(tables) if markdown else print_tables(tables)
-    say_aids(folder)
+    say(describe_controllers(folder))
 
 
 def report(
@@ -184,13 +184,6 @@ def export(
     say(results.describe_missing(folder))
     files = export_folder(folder, out, format_)
     say(f"{len(files)} files in {out}")
-
-
-def say_aids(folder: Path) -> None:
-    """Print which controllers of a folder have the aids, where it has several."""
-    from servobench.harness.analysis.folder import describe_controllers
-
-    say(describe_controllers(folder))
 
 
 def print_faults(folder: Path, runs: pd.DataFrame) -> None:

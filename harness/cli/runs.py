@@ -11,7 +11,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, named_option, option, switch
-from servobench.harness.cli.results import judge, print_faults, report, say_aids
+from servobench.harness.cli.results import judge, print_faults, report
 from servobench.harness.cli.terminal import console, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import point_latest
@@ -163,7 +163,7 @@ def _carry_out(
     campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
-    from servobench.harness.analysis.folder import name_twins
+    from servobench.harness.analysis.folder import describe_controllers, name_twins
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
@@ -175,7 +175,7 @@ def _carry_out(
         carry_out(campaign, folder, watched)
         runs = results.load_runs(folder)
         print_tables(summary_tables(name_twins(folder, runs)), summary_legend(runs))
-        say_aids(folder)
+        say(describe_controllers(folder))
         print_faults(folder, runs)
         if out is None:
             point_latest(folder)

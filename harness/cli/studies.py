@@ -10,7 +10,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option, switch
-from servobench.harness.cli.results import judge, say_aids
+from servobench.harness.cli.results import judge
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
 
@@ -48,6 +48,7 @@ def sweep(
 
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
+    from servobench.harness.analysis.folder import describe_controllers
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
@@ -63,7 +64,7 @@ def sweep(
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = sweep_legend(results.iterate_runs(out, columns))
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
-    say_aids(out)
+    say(describe_controllers(out))
     say(f"table in {out / results.RUNS}")
     judge(out, strict=running.strict)
 
