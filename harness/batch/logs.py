@@ -21,7 +21,7 @@ from servobench.plant.robot.mismatch import Mismatch
 
 TABLES: Final = (".csv", ".parquet")  # suffixes
 MAX_PERIOD: Final = 2.0  # [s] between rows of a log
-TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
+TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
 CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plants, controllers and set-ups
 TASK: Final = "circle"  # likewise, without effect
@@ -77,14 +77,13 @@ def logged_in_folder(
     if steps.empty:
         raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
     names = ("plant", "task", "mismatch", "robot", "sensing")
-    asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])}
-    if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
-        del asked["robot"]
+    own = row.get("robot") == OWN_ROBOT  # which comes with the plant
+    asked = {name: row[name] for name in names if name in row and not (own and name == "robot")}
     with configuration_errors(f"{folder} has a varied setting that is no value: "):
         varied = varied_in_row(row)
     if controller:
         varied = tuple((key, value) for key, value in varied if not key.startswith("controller."))
-    request = RunRequest(controller=controller or row["controller"], varied=varied, **asked)
+    request = RunRequest(controller=controller or row["controller"], seed=int(row["seed"]), varied=varied, **asked)
     return resolve(request, _settings_of(request, manifest, own=not controller)), steps
 
 
@@ -127,25 +126,24 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
         raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(TABLES)}")
     table = read_table("log", path)
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)
-    return resolve(request, Settings({"run": {"period": _period(path, table)}})), table
+    settings = {"run": {"period": _period(path, table)}, PLANT: {"command_delay": 0.0}}  # which any period divides
+    return resolve(request, Settings(settings)), table
 
 
 def _period(path: Path, table: pd.DataFrame) -> float:
-    """Return the control period [s] of a log, the median distance of its rows; refuse other distances."""
+    """Return the control period [s] of a log, the mean distance of its rows; refuse rows at other distances."""
     times = numbers_of(f"log {path}", table, ["time_s"])[:, 0]
     steps = np.diff(times)
-    period = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
-    if not 0.0 < period <= MAX_PERIOD:
+    usual = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
+    if not 0.0 < usual <= MAX_PERIOD:
         needed = "it needs two or more, and time_s in s, not in ms"
-        raise ConfigurationError(f"log {path} has {len(times)} rows, {period:g} s apart; {needed}")
-    nearest = round(period, 6)
-    if abs(nearest - period) <= np.spacing(np.abs(times).max()):  # times since 1970 are rounded in double precision
-        period = nearest
-    late = np.abs(times - times[0] - period * np.arange(len(times))) > TIME_TOLERANCE
-    if late.any():
-        row = int(late.argmax())
-        raise UnevenRows(
-            f"log {path}: row {row} is {steps[row - 1]:g} s after the row before, and rows must be the control period "
-            f"of {period:g} s apart: sort them, leave out doubled ones, or resample the log at equal steps"
-        )
-    return period
+        raise ConfigurationError(f"log {path} has {len(times)} rows, {usual:g} s apart; {needed}")
+    mean, tolerance = float(np.mean(steps)), min(TIME_TOLERANCE, usual / 8.0)
+    late = np.abs(times - times[0] - mean * np.arange(len(times))) > tolerance
+    uneven = [*(np.flatnonzero(np.abs(steps - usual) > 2.0 * tolerance) + 1), *np.flatnonzero(late)]
+    if uneven:
+        found = f"log {path}: row {uneven[0]} is {steps[uneven[0] - 1]:g} s after the row before, and rows must be the"
+        remedy = "sort them, leave out doubled ones, or resample the log at equal steps"
+        raise UnevenRows(f"{found} control period of {usual:g} s apart: {remedy}")
+    digits = (round(mean, count) for count in range(3, 12))
+    return next((each for each in digits if abs(each - mean) * len(steps) < 0.1 * tolerance), mean)

@@ -187,8 +187,7 @@ def identify(
         wanted = f"identify a table, such as steps.parquet, with --robot {own.twin.keys.robot}"
         raise ConfigurationError(f"{request.robot} is itself a twin, which no twin can deviate from: {wanted}")
     if not log.is_dir():  # a table does not say at which speed commands are clipped: at that of the robot
-        plant = replace(resolved.plant, max_joint_speed=float(own.limits.speed.max()))
-        resolved = replace(resolved, plant=plant)
+        resolved = replace(resolved, plant=replace(resolved.plant, max_joint_speed=float(own.limits.speed.max())))
     experiment = build(resolved)
     rows = read_log(experiment.plant.spec, table)
     experiment.plant.close()
@@ -210,7 +209,8 @@ def identify(
             )
             text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
-        clock = f" --set run.period={resolved.run.period:g}" * (resolved.run.period != RunSettings.period)
+        period = max(round(resolved.run.period, 3), 0.001)  # as delays of a twin are no multiples of any other
+        clock = f" --set run.period={period:g}" * (period != RunSettings.period)
         next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic{clock}"
         say(f"twin in {out}; the next command: {next_one}")
 

@@ -456,10 +456,11 @@ def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path,
     out.parent.mkdir()
     write(tmp_path, text(arm_tree(find_robot(ROBOT).arm, find_robot(ROBOT))), "arm.urdf")
     monkeypatch.chdir(tmp_path)
+    table = table.assign(time_s=table["time_s"] / 1.5)
     table[::2].drop(columns=[name for name in table if name.startswith("true_")]).to_csv(log, index=False)
     told = output_of("identify", log, "--robot", "arm.urdf", "--out", out)
     assert "gear_elbow" in told
-    assert f"servobench compare --robot '{out}' --plants kinematic --set run.period=0.1" in told
+    assert f"servobench compare --robot '{out}' --plants kinematic --set run.period=0.067\n" in told
     assert out.read_text(encoding="utf-8").startswith('robot = "../arm.urdf"')
     monkeypatch.chdir(out.parent)
     row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row

@@ -154,6 +154,7 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of
         (lambda table: table.loc[table.index.repeat(2)],
          "row 1 is 0 s after the row before, .* leave out doubled ones"),
         (lambda table: table.iloc[::-1], "row 1 is -0.05 s after the row before"),
+        (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (table.index == 7)), "row 7 is 0.053 s after"),
         (lambda table: table.assign(time_s=1000.0 * table["time_s"]),
          "has 80 rows, 50 s apart; it needs two or more, and time_s in s, not in ms"),
         (lambda table: table.assign(time_s=[f"{time} s" for time in table["time_s"]]),
@@ -169,6 +170,13 @@ def test_a_log_whose_clock_counts_from_1970_is_shown_like_one_that_begins_at_0(s
     table = own_log(steps)
     seen, late = (show(table.assign(time_s=begin + table["time_s"]), tmp_path / "robot.csv") for begin in (0.0, 1.76e9))
     np.testing.assert_allclose(commands(late), commands(seen), rtol=1e-5)
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.76e9])
+@pytest.mark.parametrize("digits", [3, 9])
+def test_a_log_at_a_cameras_30_hz_is_shown_whatever_its_stamps_are_rounded_to(steps, tmp_path, begin, digits):
+    table = own_log(steps).assign(time_s=begin + np.round(np.arange(len(steps)) / 30.0, digits))
+    assert np.diff(show(table, tmp_path / "robot.csv")["time_s"]) == pytest.approx(1.0 / 30.0, abs=2e-5)
 
 
 def test_what_is_no_log_is_refused(folder):
