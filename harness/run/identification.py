@@ -51,6 +51,10 @@ EXPOSURE: Final = ("latency", *EXTRAS[:5])  # which joints a frame shows
 ARM: Final = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
 MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
+FASTEST: Final = 1.5  # [1] speed of a joint over its limit at most
+MAX_JUMP: Final = 0.05  # [rad] from row to row, beyond this speed
+MAX_REPEATED: Final = 0.02  # [1] share of frames that equal another one although the arm moves
+MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
 TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
 SWINGS: Final = np.geomspace(1.0, 20.0, 120)  # [s] periods of the search
@@ -86,17 +90,36 @@ class Log(NamedTuple):
         return float(beyond[row, joint]), f"{place}, beyond its range of {limits}"
 
     def joint_mistake(self) -> str:
-        """Name joints in degrees, or one that jumps by a turn from row to row, far beyond its speed; empty for none."""
+        """Name joints in degrees, or one that jumps by a turn from row to row; empty for none."""
         excess, where = self.farthest_joint()
         if excess > np.pi:
             return f"{where}; if the log is in degrees, write it in rad"
+        jump, is_turn = self.first_jump()
+        return jump if is_turn else ""
+
+    def first_jump(self) -> tuple[str, bool]:
+        """Return where a joint moves far beyond its speed, with the remedy, empty for nowhere; and if by a turn."""
         jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
-        jumps[np.abs(jumps - 2.0 * np.pi) > MAX_OFF_TURN] = 0.0
-        row, joint = np.unravel_index(int(jumps.argmax()), jumps.shape)
-        if jumps[row, joint] <= 2.0 * self.spec.joint_velocity_limit[joint] * self.spec.period:
-            return ""
+        beyond = np.argwhere(jumps > FASTEST * self.spec.joint_velocity_limit * self.spec.period + MAX_JUMP).tolist()
+        if not beyond:
+            return "", False
+        row, joint = beyond[0]
         where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
-        return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)"
+        if abs(jumps[row, joint] - 2.0 * np.pi) <= MAX_OFF_TURN:
+            return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)", True
+        return f"{where}, faster than it can move: interpolate positions that are missing or held, or cut there", False
+
+    def frame_mistake(self) -> str:
+        """Name frames given as new that equal the one before, or are all the same, although the arm moves."""
+        rows = np.flatnonzero(self.valid)
+        _, kinds, counts = np.unique(self.features[rows], axis=0, return_inverse=True, return_counts=True)
+        same = (np.diff(kinds) == 0) | (counts[kinds[1:]] > MAX_REPEATED * len(rows))  # as 0 stands for no frame
+        moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
+        share = float(np.mean(same[moving])) if moving.any() else 0.0
+        if share <= MAX_REPEATED:
+            return ""
+        found = f"{share:.0%} of the frames repeat another one although the arm moves, first in row "
+        return f"{found}{rows[1:][same & moving][0]}: give rows without a new frame feature_valid = 0"
 
 
 def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> Log:
@@ -106,9 +129,12 @@ def read_log(spec: PlantSpec, table: pd.DataFrame, least: int = MIN_FRAMES) -> L
         ConfigurationError: a column or a number is missing, or fewer than `least` frames are valid.
     """
     names, rows = column_names(spec), np.arange(len(table))
+    frames = table.filter(names["feature"])
+    lost = frames.isna().all(axis=1)  # as a log may write a row without a new frame
+    table = table.assign(**frames.where(~lost, frames.ffill().bfill(), axis=0))
     joints, features = (numbers_of(LOG, table, names[each]) for each in ("joint_position", "feature"))
-    given = "feature_valid" in table
-    valid = numbers_of(LOG, table, ["feature_valid"])[:, 0] != 0.0 if given else np.ones(len(rows), dtype=np.bool_)
+    told = numbers_of(LOG, table, ["feature_valid"])[:, 0] if "feature_valid" in table else np.ones(len(rows))
+    valid = (told != 0.0) & ~lost.to_numpy()
     lacking = [name for name in names[COMMAND] if name not in table]
     if lacking and any(str(name).startswith(VELOCITY) for name in table):
         remark(f"the log has columns {VELOCITY}_… but no {', '.join(lacking)}: commands are left out")

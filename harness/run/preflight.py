@@ -18,8 +18,6 @@ from servobench.plant.robot.hand_eye import RobotModel
 
 MAX_RATIO: Final = 20.0  # [1] of the motion of features in m and that of the nominal robot
 UNITS: Final = {"inches": 0.0254, "cm": 1e-2, "mm": 1e-3}  # [m]
-MAX_REPEATED: Final = 0.02  # [1] share of frames that equal the one before although the arm moves
-MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNEXPLAINED: Final = 1.5  # [1] residuals over the noise from frame to frame, above which something is wrong
 REFUSED_SHARE: Final = 0.1  # [1] of the motion of features, from which errors that nothing explains are refused
 MIN_SHARE: Final = 0.01  # [1] of the motion of features, below which residuals are small in any case
@@ -54,7 +52,7 @@ def mistakes(log: Log, model: RobotModel, others: Others = dict) -> tuple[str, I
         model: nominal robot under the sensing of the log.
         others: returns the nominal models of other arms by name; called for a log with a mistake.
     """
-    found = log.joint_mistake() or _units(log, model) or _repeats(log)
+    found = log.joint_mistake() or log.first_jump()[0] or _units(log, model) or log.frame_mistake()
     if found:
         return found, None
     robot = identify(log, model)
@@ -131,19 +129,6 @@ def _units(log: Log, model: RobotModel) -> str:
 
 def _spread(values: FloatArray) -> FloatArray:
     return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
-
-
-def _repeats(log: Log) -> str:
-    """Name frames that are given as new and equal the one before, although the arm moves."""
-    rows = np.flatnonzero(log.valid)
-    same = (np.diff(log.features[rows], axis=0) == 0.0).all(axis=1)
-    moving = np.abs(np.diff(log.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
-    share = float(np.mean(same[moving])) if moving.any() else 0.0
-    if share <= MAX_REPEATED:
-        return ""
-    row = int(rows[1:][same & moving][0])
-    found = f"{share:.0%} of the frames repeat the one before although the arm moves, first in row {row}"
-    return f"{found}: give rows without a new frame feature_valid = 0"
 
 
 def _large_errors(log: Log, robot: Identified) -> str:

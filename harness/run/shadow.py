@@ -82,8 +82,8 @@ class LoggedPlant(Plant):
         spec, (excess, where) = self.spec, self.log.farthest_joint()
         if mistake := self.log.joint_mistake():
             raise ConfigurationError(mistake)
-        if excess > MAX_EXCESS:
-            remark(where)
+        for found in filter(None, (where * (excess > MAX_EXCESS), self.log.first_jump()[0], self.log.frame_mistake())):
+            remark(found)
         for kind, values in (("feature", self.log.features), ("reference", self.reference)):
             sizes, unit = np.abs(values).max(axis=1), spec.feature.unit
             far, size = int(sizes.argmax()), float(sizes.max())

@@ -266,6 +266,14 @@ def repeated(log):
     return log._replace(features=y)
 
 
+def zeros(log):
+    return log._replace(features=np.where((np.arange(len(log.time)) % 20 == 0)[:, None], 0.0, log.features))
+
+
+def lost(log):
+    return log._replace(joints=log.joints * (np.arange(len(log.time)) != 90)[:, None])
+
+
 MISTAKES = {
     "exchanged": (exchanged, "joints shoulder_lift and elbow are exchanged"),
     "drifting": (drifting, r"frames come 40 ± \d ms later at the end than at the begin"),
@@ -274,7 +282,9 @@ MISTAKES = {
         r"frames come (69|70) ms before the joints are where they show them, as clocks of camera and joints",
     ),
     "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
-    "repeated": (repeated, r"25% of the frames repeat the one before although the arm moves, first in row \d+"),
+    "repeated": (repeated, r"25% of the frames repeat another one although the arm moves, first in row \d+"),
+    "zeros": (zeros, r"5% of the frames repeat another one .* first in row 20: give rows without .* feature_valid = 0"),
+    "lost": (lost, r"joint \w+ jumps by .* rad in row 90, faster than it can move: interpolate"),
     "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
     "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "; if the log is in degrees, write it in rad"),
     "centimetres": (lambda log: log._replace(features=1e2 * log.features), "likely in cm; write them in m"),

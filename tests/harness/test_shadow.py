@@ -179,6 +179,13 @@ def test_a_log_at_a_cameras_30_hz_is_shown_whatever_its_stamps_are_rounded_to(st
     assert np.diff(show(table, tmp_path / "robot.csv")["time_s"]) == pytest.approx(1.0 / 30.0, abs=2e-5)
 
 
+def test_a_row_whose_features_are_nan_has_no_new_frame(steps, tmp_path):
+    table = own_log(steps).drop(columns="feature_valid")
+    table.loc[5::7, table.filter(like="feature_").columns] = np.nan
+    seen = show(table, tmp_path / "robot.csv")
+    assert seen["feature_valid"].tolist() == table["feature_x_m"].notna().tolist()
+
+
 def test_what_is_no_log_is_refused(folder):
     with pytest.raises(ConfigurationError, match="has no run 'other'"):
         logged_in_folder(folder, "other", None)
@@ -189,6 +196,8 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
     "degrees": (JOINTS, np.degrees, "rad, beyond its range of .*; if the log is in degrees, write it in rad", True),
     "millimetres": (FEATURES, lambda y: 1000.0 * y, "if the log is in mm, write it in m", True),
     "wrapped": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi), "unwrap it", True),
+    "zeros": (FEATURES[:3], lambda y: np.where(np.arange(len(y))[:, None] % 9, y, 0.0), "feature_valid = 0", False),
+    "held": (JOINTS, lambda q: np.where(np.arange(len(q))[:, None] % 60, q, q[0]), "faster than it can move", False),
     "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
     "sign": (JOINTS, np.negative, "move otherwise than this robot's at these joints", False),
     "kilometres": (FEATURES, lambda y: y / 1000.0, "move otherwise than this robot's at these joints", False),
