@@ -262,7 +262,7 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
         results.load_runs(folder)  # refuses a table of anything else, whose names are of files
         check_same_batch(folder, manifest, note, remedy="leave it away")
         if not (parts := results.finished_runs(folder)):
-            raise ConfigurationError(f"{folder} holds no part of a batch but a whole one, with nothing to be merged")
+            raise ConfigurationError(f"{folder} holds a whole batch, no part; join tables of several with pandas")
         found += [(each, folder) for each in parts]
     found.sort(key=lambda pair: pair[0].start)
     for (runs, folder), (others, other) in pairwise(found):

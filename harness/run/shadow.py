@@ -66,9 +66,7 @@ class LoggedPlant(Plant):
         self.reference = numbers_of(LOG, table, column_names(spec)["reference"])
         if not self.log.valid.any():
             raise ConfigurationError("the log has no row whose feature_valid is 1 or true")
-        true = column_names(spec)["true_feature"]
-        known = set(true) <= set(table)
-        self._true = table[true].to_numpy(np.float64) if known else np.full_like(self.log.features, np.nan)
+        self._true = table.reindex(columns=column_names(spec)["true_feature"]).to_numpy(np.float64)
 
     def check_units(self, model: RobotModel | None) -> None:
         """Refuse joints and features that no robot of this kind has, and remark on features that move otherwise.

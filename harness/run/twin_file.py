@@ -14,6 +14,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.twin import TIMES
 
+MIN_TIMES: Final = 1e-3  # [s] of delay and lag, below which no drive is
 MIN_DEVIATION: Final = 1e-4  # [s] of delay and lag, as they are printed
 SHOWN: Final = 0.05  # [1] of the largest entry of a direction, from which a parameter is named
 WHITE: Final = 3.0  # [1] deviations of a correlation from none, up to which residuals count as white
@@ -67,9 +68,10 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
         lines.append(f"joints that hardly move: {', '.join(still)}")
     if response is None:
         lines.append(f"not told: delay and lag, as {untold_response(log)}")
+    elif response.delay + response.lag < MIN_TIMES:
+        lines.append("joints follow commands at once: these are likely their measured speeds; log what was sent")
     elif response.unexplained > SUSPECT:
-        left = f"{response.unexplained:.0%} of the joint motion"
-        lines.append(f"delay and lag leave {left}: the drive is no first-order lag")
+        lines.append(f"delay and lag leave {response.unexplained:.0%} of joint motion: the drive is no first-order lag")
     if response is not None and response.level < math.inf:
         lines.append(f"commands act as if clipped at {response.level:.3g} rad/s: log them as they are sent")
     for section, settings in sensor(log, robot).settings.items():

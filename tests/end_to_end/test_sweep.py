@@ -102,7 +102,7 @@ def test_folders_that_are_no_parts_of_one_batch_are_not_merged(refusal_of, undis
     capsys.readouterr()
     wrong = {
         part: "have the same runs: leave one away",
-        str(undisturbed): "nothing to be merged",
+        str(undisturbed): "holds a whole batch, no part; join tables of several with pandas",
         other: "seeds 0:5 there",
     }
     for folder, words in wrong.items():

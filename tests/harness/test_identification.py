@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from kit.own import write
 from servobench import run
-from servobench.harness.run.drive import command_mistake, command_response, joint_steps, untold_response
+from servobench.harness.run.drive import Response, command_mistake, command_response, joint_steps, untold_response
 from servobench.harness.run.experiment import draw_robot
 from servobench.harness.run.identification import (
     _Problem,
@@ -328,6 +328,8 @@ def test_what_is_printed_names_units_and_what_the_log_does_not_tell():
     assert "residuals over time are white" in lines
     assert "not told: zero_shoulder_pan with camera_turn_" in lines
     assert "not told: delay and lag, as every joint moves against its command" in lines
+    at_once = Response(0.0, 2e-4, np.eye(2), 0.0, np.inf)
+    assert "joints follow commands at once: these are likely their" in "\n".join(remarks(log, identified(), at_once))
     assert "joints that hardly move: wrist_3" in "\n".join(remarks(still, identified(), None))
     values = np.where(np.array(identified().names) == "zero_elbow", 1.0, identified().values)
     assert "far from the nominal robot: zero_elbow" in "\n".join(
