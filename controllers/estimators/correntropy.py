@@ -21,7 +21,7 @@ import numpy as np
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of, joseph, symmetric
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import branch, norm, outer
+from servobench.plant.contract.lanes import norm, outer, repeat
 from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
@@ -123,9 +123,10 @@ def fixed_point_update(
     B = cholesky_of(P)
     h = np.vecmat(joint_step[..., None, :], B)
 
-    def improved(
-        at: Iterate, J: FloatArray, B: FloatArray, h: FloatArray, dq: FloatArray, dy: FloatArray, r: FloatArray
-    ) -> Iterate:
+    given: tuple[FloatArray, ...] = J, B, h, joint_step, feature_step, r
+
+    def improved(tree: tuple[Iterate, tuple[FloatArray, ...]]) -> tuple[Iterate, tuple[FloatArray, ...]]:
+        at, (J, B, h, dq, dy, r) = tree
         error = (dy - np.matvec(at.J, dq)) / np.sqrt(r)[..., None]
         spread, w = h / weight(at.prior), weight(error)
         share = w / (w * np.vecdot(h, spread) + r[..., None])
@@ -133,13 +134,10 @@ def fixed_point_update(
         nu = dy - np.matvec(J, dq)
         new = J + nu[..., None] * gain
         change, size = (norm(each.reshape(*each.shape[:-2], -1)) for each in (new - at.J, at.J))
-        return Iterate(new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size)
+        return Iterate(new, gain, -(share * nu)[..., None] * spread, change > config.tolerance * size), tree[1]
 
     at = Iterate(J, np.zeros_like(J), np.zeros_like(J), np.ones_like(r, dtype=np.bool_)[()])
-    for _ in range(config.iterations):
-        if not np.any(at.moves):
-            break
-        at = branch(at.moves, improved, at, J, B, h, joint_step, feature_step, r)
+    at, _ = repeat(lambda tree: tree[0].moves, improved, (at, given), config.iterations)
     return corrected(J, P, at.gain, joint_step, feature_step, r=r)
 
 
