@@ -62,6 +62,18 @@ const char *core_check_stop_time(const Core *core)
 #define TOO_FEW "too few values for these variables"
 #define TOO_MANY "too many values for these variables"
 
+/* Whether variables exist, begin below `end` and have as many values as there is room for. */
+static const char *check(Variables variables, size_t end, const char *missing)
+{
+    size_t k = 0;
+    for (size_t i = 0; i < variables.count; i++) {
+        const size_t size = size_of(variables.references[i]);
+        if (size == 0 || variables.references[i] >= end) return missing;
+        k += size;
+    }
+    return k < variables.n_values ? TOO_MANY : k > variables.n_values ? TOO_FEW : NULL;
+}
+
 static const char *get_value(Core *core, size_t index, double *value)
 {
     if (index < N_VALUES) return model_get(&core->model, index, value);
@@ -71,17 +83,12 @@ static const char *get_value(Core *core, size_t index, double *value)
 
 const char *core_get(Core *core, Variables variables, double values[])
 {
-    size_t k = 0;
-    for (size_t i = 0; i < variables.count; i++) {
-        const size_t first = variables.references[i], size = size_of(first);
-        if (size == 0) return NO_SUCH_VARIABLE;
-        if (k + size > variables.n_values) return TOO_FEW;
-        for (size_t j = 0; j < size; j++) {
-            const char *message = get_value(core, first + j, &values[k++]);
-            if (message != NULL) return message;
-        }
+    const char *message = check(variables, N_VALUES + 1, NO_SUCH_VARIABLE);
+    for (size_t i = 0; message == NULL && i < variables.count; i++) {
+        const size_t first = variables.references[i], end = first + size_of(first);
+        for (size_t j = first; message == NULL && j < end; j++) message = get_value(core, j, values++);
     }
-    return k == variables.n_values ? NULL : TOO_MANY;
+    return message;
 }
 
 static const char *set_value(Core *core, size_t index, double value)
@@ -94,39 +101,20 @@ static const char *set_value(Core *core, size_t index, double value)
 
 const char *core_set(Core *core, Variables variables, const double values[])
 {
-    size_t k = 0;
-    for (size_t i = 0; i < variables.count; i++) {
-        const size_t first = variables.references[i], size = first < N_VALUES ? size_of(first) : 0; /* not the time */
-        if (size == 0) return NO_SUCH_VARIABLE;
-        if (k + size > variables.n_values) return TOO_FEW;
-        for (size_t j = 0; j < size; j++) {
-            const char *message = set_value(core, first + j, values[k++]);
-            if (message != NULL) return message;
-        }
+    const char *message = check(variables, N_VALUES, NO_SUCH_VARIABLE); /* not the time */
+    for (size_t i = 0; message == NULL && i < variables.count; i++) {
+        const size_t first = variables.references[i], end = first + size_of(first);
+        for (size_t j = first; message == NULL && j < end; j++) message = set_value(core, j, *values++);
     }
     if (core->phase & STARTING) model_start(&core->model);
-    return k == variables.n_values ? NULL : TOO_MANY;
-}
-
-/* Whether variables exist, begin below `end` and have as many values as there is room for. */
-static const char *check(Variables variables, size_t end)
-{
-    size_t k = 0;
-    for (size_t i = 0; i < variables.count; i++) {
-        const size_t size = size_of(variables.references[i]);
-        if (size == 0 || variables.references[i] >= end) {
-            return end == N_VALUES ? "this is no unknown" : "this is no known";
-        }
-        k += size;
-    }
-    return k < variables.n_values ? TOO_MANY : k > variables.n_values ? TOO_FEW : NULL;
+    return message;
 }
 
 const char *core_derive(Core *core, Variables unknowns, Variables knowns, const double seed[], double product[])
 {
     double direction[N_VALUES] = {0.0};
-    const char *message = check(knowns, N_SETTABLE);
-    if (message == NULL) message = check(unknowns, N_VALUES);
+    const char *message = check(knowns, N_SETTABLE, "this is no known");
+    if (message == NULL) message = check(unknowns, N_VALUES, "this is no unknown");
     for (size_t i = 0; message == NULL && i < knowns.count; seed += size_of(knowns.references[i++])) {
         memcpy(direction + knowns.references[i], seed, size_of(knowns.references[i]) * sizeof(double));
     }
@@ -151,8 +139,8 @@ static double weighed(const double direction[N_VALUES], Variables unknowns, cons
 /* From one direction for each known: the model has some hundred values, and no tape. */
 const char *core_derive_adjoint(Core *core, Variables unknowns, Variables knowns, const double seed[], double product[])
 {
-    const char *message = check(knowns, N_SETTABLE);
-    if (message == NULL) message = check(unknowns, N_VALUES);
+    const char *message = check(knowns, N_SETTABLE, "this is no known");
+    if (message == NULL) message = check(unknowns, N_VALUES, "this is no unknown");
     for (size_t i = 0; message == NULL && i < knowns.count; i++) {
         const unsigned first = knowns.references[i];
         for (size_t j = 0; message == NULL && j < size_of(first); j++) {

@@ -73,6 +73,6 @@ def test_random_calls_touch_no_memory_but_their_own(version, kind, tmp_path):
 
 @NEEDS_SANITIZERS
 def test_a_missing_check_is_found(tmp_path):
-    program = build(tmp_path, controller(3), defect="k + size > variables.n_values")
+    program = build(tmp_path, controller(3), defect="k > variables.n_values")
     with pytest.raises(AssertionError, match="AddressSanitizer|runtime error"):
         run(program, CALLS, seed=1)
