@@ -1,7 +1,7 @@
 """Exports a controller as a co-simulation FMU: a recorded step, its variables, its reference run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from servobench.fmus.model_description import Description, sampled_sections
 from servobench.fmus.product import Product, c_files, documentation, word
-from servobench.fmus.reference import ReferenceRun
+from servobench.fmus.reference import tables
 from servobench.fmus.sources import generated_source
 from servobench.fmus.trace.branches import NOT_DEFINITE
 from servobench.fmus.trace.record import Recorded
@@ -50,7 +50,7 @@ class ControllerModel:
     recorded: Recorded  # its step, of the columns [time, inputs]
     groups: tuple[Group, ...]  # from `controller_groups`
     period: float  # s
-    run: ReferenceRun  # of the original, with its outputs for the inputs at the same time
+    run: Mapping[str, FloatArray]  # of the original: time, inputs and the outputs for them by name, (k, size)
     settings: str  # of the original, for the documentation
 
     @property
@@ -71,7 +71,7 @@ class ControllerModel:
             start: values of inputs by name, (size,), at the start; zeros for others, and ones for `seen`.
         """
         layout = Layout(self.groups)
-        starts = {SEEN: np.ones_like(self.run.inputs[SEEN][0]), **(start or {})}
+        starts = {SEEN: np.ones_like(self.run[SEEN][0]), **(start or {})}
         return Product(
             fmi_version=fmi_version,
             folder=MODEL,
@@ -116,6 +116,6 @@ class ControllerModel:
 
     def _reference(self, layout: Layout) -> tuple[str, str]:
         """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
-        outputs = self.run.outputs
-        before = {name: np.vstack([np.zeros(rows.shape[1]), rows[:-1]]) for name, rows in outputs.items()}
-        return replace(self.run, outputs=before).tables(layout)
+        rows = {each.name: self.run[each.name] for each in layout.of_role(SAMPLED)}
+        before = {name: np.vstack([np.zeros_like(part[:1]), part[:-1]]) for name, part in rows.items()}
+        return tables({**self.run, **before}, layout)

@@ -12,7 +12,7 @@ import numpy as np
 from servobench.fmus.compiler import CODE, Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections, exporter
 from servobench.fmus.product import Product, c_files, check_version, documentation, word
-from servobench.fmus.reference import reference_run
+from servobench.fmus.reference import reference_run, tables
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.bench.plant import PlantSetup
@@ -158,7 +158,7 @@ def product(options: ExportOptions) -> Product:
             feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
             mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
         ),
-        reference=reference_run(options.setup, options.config).tables(layout),
+        reference=tables(reference_run(options.setup, options.config), layout),
     )
 
 

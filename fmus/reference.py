@@ -3,11 +3,10 @@
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.fmus.variables import BALL, FEATURE, SEEN, Layout
+from servobench.fmus.variables import BALL, FEATURE, INPUT, SEEN, Layout
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
@@ -20,20 +19,19 @@ OUTPUT_FILE = "extra/servobench/reference_output.csv"
 COMMAND = "joint_velocity_command"
 
 
-@dataclass(frozen=True)
-class ReferenceRun:
-    """Inputs, each held over the step that begins at its time, and the outputs at those times."""
+def tables(run: Mapping[str, FloatArray], layout: Layout) -> tuple[str, str]:
+    """Return the inputs and all other variables of a run as CSV.
 
-    time: FloatArray  # (k,), s
-    inputs: Mapping[str, FloatArray]  # by name, (k, size)
-    outputs: Mapping[str, FloatArray]  # by name, (k, size)
+    Args:
+        run: `time` in s, (k,), and variables by name, (k, size); each input is held over the step that begins then.
+        layout: of the variables.
+    """
+    others = {name: rows for name, rows in run.items() if name != "time"}
+    inputs = {name: others.pop(name) for name in run if name in others and layout.by_name[name].role == INPUT}
+    return table(run["time"], inputs, layout), table(run["time"], others, layout)
 
-    def tables(self, layout: Layout) -> tuple[str, str]:
-        """Return inputs and outputs as CSV."""
-        return table(self.time, self.inputs, layout), table(self.time, self.outputs, layout)
 
-
-def reference_run(setup: PlantSetup, config: KinematicConfig) -> ReferenceRun:
+def reference_run(setup: PlantSetup, config: KinematicConfig) -> dict[str, FloatArray]:
     """Return the reference run of the kinematic plant; some of its commands exceed the speed limit."""
     world = KinematicWorld(config, setup)
     limit = world.spec.command.upper
@@ -47,7 +45,7 @@ def reference_run(setup: PlantSetup, config: KinematicConfig) -> ReferenceRun:
     measured = FEATURE if isinstance(setup.model, SetupModel) else BALL
     names = ("joint_position", "joint_velocity", measured, SEEN, "encoder_position")
     outputs = dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
-    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * setup.period, {COMMAND: wanted}, outputs)
+    return {"time": np.arange(STEPS + 1, dtype=np.float64) * setup.period, COMMAND: wanted, **outputs}
 
 
 def read_table(text: str) -> tuple[list[str], FloatArray]:

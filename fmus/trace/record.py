@@ -153,7 +153,7 @@ def record(
     try:
         own = deepcopy(system)
     except TypeError as error:
-        raise NotTraceable("it holds something that is no formula, such as a solver") from error
+        raise NotTraceable("it holds something that is no formula, such as a solver; take another law") from error
     try:
         with recording():
             values, u = _inputs(inputs)

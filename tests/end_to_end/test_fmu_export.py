@@ -266,5 +266,5 @@ def test_a_compiler_that_refuses_the_sources_is_quoted(tmp_path):
 
 def test_the_reference_run_meets_the_speed_limit():
     run_ = reference_run(nominal_setup(), KinematicConfig())
-    assert (np.abs(run_.inputs["joint_velocity_command"]) > 1.0).any()
-    assert np.abs(run_.outputs["joint_velocity"]).max() <= 1.0
+    assert (np.abs(run_["joint_velocity_command"]) > 1.0).any()
+    assert np.abs(run_["joint_velocity"]).max() <= 1.0

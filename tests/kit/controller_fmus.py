@@ -38,10 +38,10 @@ def exported(name: str, version: int) -> Path:
     return cached("controllers_of_tests", file, make) / f"{file}.fmu"
 
 
-def experiment(name: str, **settings: object) -> Experiment:
+def experiment(name: str, sensing: str = "position", **settings: object) -> Experiment:
     """Return a run, mostly on a circle, with noise, latency, delay, lost frames and a camera that is turned."""
     lossy = {"sensing": {"drop_probability": 0.05}} | settings
-    request = RunRequest("kinematic", name, TASKS.get(name, "circle"), "severe", 8)
+    request = RunRequest("kinematic", name, TASKS.get(name, "circle"), "severe", 8, sensing=sensing)
     return build(resolve(request, Settings({"kinematic": lossy})))
 
 
