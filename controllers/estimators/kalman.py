@@ -111,7 +111,7 @@ def kalman_update(
         The new Jacobian and covariance.
     """
     *lead, m, n = J.shape
-    x, H = J.reshape(*lead, m * n), np.einsum("ij,...k->...ijk", np.eye(m), joint_step).reshape(*lead, m, m * n)
+    x, H = J.reshape(*lead, m * n), (np.eye(m)[..., None] * joint_step[..., None, None, :]).reshape(*lead, m, m * n)
     HP, R = H @ P, r[..., None, None] * np.eye(m)
     K = np.linalg.solve(HP @ H.mT + R, HP).mT
     A = np.eye(m * n) - K @ H
