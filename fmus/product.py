@@ -96,12 +96,9 @@ class Product:
             The path.
 
         Raises:
-            ValueError: the folder does not exist.
             CompilerMissing: no compiler for one of the platforms.
             CompilationFailed: a compiler rejected the sources.
         """
-        if not path.parent.is_dir():
-            raise ValueError(f"the folder {path.parent} for the FMU does not exist")
         contents = {name: text.encode() for name, text in (self.sources() | self.companions()).items()}
         token = _token(contents)
         layout_name = "sources/layout.h"

@@ -32,10 +32,8 @@ def write_loop(path: Path, plant: Product, controller: Product, platforms: tuple
         The path.
 
     Raises:
-        ValueError: the folder does not exist, or an FMU cannot be compiled.
+        ValueError: an FMU cannot be compiled, or the folder takes no file.
     """
-    if not path.parent.is_dir():
-        raise ValueError(f"the folder {path.parent} for the SSP does not exist")
     products = {PLANT: plant, CONTROLLER: controller}
     contents = {STRUCTURE: structure(products, stop)}
     with tempfile.TemporaryDirectory(prefix="servobench-ssp-") as folder:

@@ -56,10 +56,12 @@ class Export:
         return RunRequest(*names, read_mismatch(self.mismatch), self.seed, robot=self.robot, sensing=self.sensing)
 
 
-def check_ending(output: Path, ending: str) -> None:
-    """Raise ConfigurationError if the file to write does not end as importing tools expect it to."""
+def check_output(output: Path, ending: str) -> None:
+    """Raise ConfigurationError if the file to write has no folder, or does not end as importing tools expect it to."""
     if output.suffix != ending:
         raise ConfigurationError(f"--output must end in {ending}, got {output}")
+    if not output.parent.is_dir():
+        raise ConfigurationError(f"the folder {output.parent} for {output.name} does not exist")
 
 
 @fmu_app.command()
@@ -89,7 +91,7 @@ def export(
         raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
     if controller is not None and (exported.mismatch != "none" or exported.seed):
         raise ConfigurationError("--mismatch and --seed are for an arm; a controller does not know them")
-    check_ending(output, ".fmu")
+    check_output(output, ".fmu")
     with exported.compiling() as platforms:
         request = exported.request(controller or "constant", settings)
         if controller is None:
@@ -119,7 +121,7 @@ def ssp(
     from servobench.fmus.ssp import write_loop
     from servobench.harness.run.export import loop_products
 
-    check_ending(output, ".ssp")
+    check_output(output, ".ssp")
     settings = overrides.settings()
     request = exported.request(controller, settings)
     with exported.compiling() as platforms:

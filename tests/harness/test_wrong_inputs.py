@@ -258,7 +258,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "--controller", "calibrated", "-o", "new.fmu"), "it is given the true robot"),
     (("fmu", "export", "--controller", "ukf_mfak", "-o", "new.fmu"), "did you mean 'ukf_mfac'?"),
     (("fmu", "export", "-o", "full"), "'full' is a directory"),
-    (("fmu", "export", "-o", "none/new.fmu"), "the folder none for the FMU does not exist"),
+    (("fmu", "export", "-o", "none/new.fmu"), "the folder none for new.fmu does not exist"),
     (("fmu", "ssp", "-o", "new.ssp"), "missing option '--controller'; see servobench fmu ssp --help"),
     (("export", "none", "--out", "new"), "none is not a results folder"),
     # names of other letters, nothing at all, the same thing twice, and paths of another kind
