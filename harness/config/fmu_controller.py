@@ -26,7 +26,7 @@ from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.settings import File, Names, Positive, Values, nested, remark, settings
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import FmuDescription, read_description, total_size
+from servobench.plant.fmu.description import NUMERIC, FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_roles, check_unit, read_mapping
@@ -40,7 +40,6 @@ CONVENTION: Final[Mapping[str, str]] = {
     "seen": "seen",
     "jacobian": "jacobian",
 }
-NUMERIC: Final = ("Real", "Float64", "Float32", "Integer", "Boolean", "Int32")
 
 
 @settings

@@ -21,6 +21,7 @@ from servobench.plant.contract.units import UNITS
 from servobench.plant.fmu.archive import DESCRIPTION
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
+NUMERIC: Final = (*REAL_TYPES, "Integer", "Boolean", "Int32")
 MAX_NUMBERS: Final = 1_000_000  # largest size of a variable
 BASES: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")  # whose exponents define a unit
 SI_UNITS: Final = {(0, 1, 0, 0, 0, 0, 0, 0): "m", (0,) * 7 + (1,): "rad", (0, 0, -1, 0, 0, 0, 0, 1): "rad/s"}
@@ -40,6 +41,7 @@ class Variable:
     # sizes of its axes: numbers, or names of structural parameters with their start values
     dimensions: tuple[tuple[str, int], ...] = ()
     unit: str = ""  # empty where none is told; see `_unit`
+    settable: bool = True  # whether the FMU takes a value for it before a run
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
@@ -97,6 +99,8 @@ class FmuDescription:
             known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
             raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}")
         for variable in found:
+            if not variable.settable and role.startswith(("parameters", "home", "camera")):
+                raise ValueError(f"{role} names {name!r}, which takes no value; wanted a parameter or a start value")
             if types is not None and variable.type not in types:
                 raise ValueError(f"{role} names {name!r}, which is of type {variable.type}; wanted a real variable")
         return found
@@ -249,7 +253,9 @@ def _variable(variable: Any, path: Path, units: Mapping[str, Any]) -> Variable: 
     size = prod(each for _, each in axes)
     if size > MAX_NUMBERS:
         raise _bad_size(variable, path, size)
-    return Variable(name, reference, size, variable.causality or "local", variable.type, axes, _unit(variable, units))
+    kind, settable = variable.causality or "local", variable.variability != "constant"
+    settable = settable and variable.initial != "calculated"
+    return Variable(name, reference, size, kind, variable.type, axes, _unit(variable, units), settable)
 
 
 def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above

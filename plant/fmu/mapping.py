@@ -22,7 +22,7 @@ from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.contract.units import SPELLINGS, UNITS
-from servobench.plant.fmu.description import FmuDescription, Variable, total_size
+from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, total_size
 from servobench.plant.fmu.library import logger
 
 Roles = TypeVar("Roles")
@@ -99,7 +99,7 @@ class FmuMapping:
     joints: Names = ()
     """Joint positions, rad; without them, commands are integrated."""
     seen: Names = ()
-    """Which features are seen: above 0.5 for each of them that is; without it all are."""
+    """Which features are seen: true, or above 0.5, for each of them that is; without it all are."""
     truth: TruthMapping = nested(TruthMapping)
     """For evaluation only."""
     home: str | None = None
@@ -181,7 +181,8 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         ("camera[1]", camera[:1], 3, "m"),
         ("camera[2]", camera[1:], 3, "rad"),
     )
-    found = {role: description.select(names, role) for role, names, *_ in roles}
+    types = {"seen": NUMERIC}
+    found = {role: description.select(names, role, types.get(role, REAL_TYPES)) for role, names, *_ in roles}
     again = ("truth.features", "truth.states")
     check_roles({role: part for role, part in found.items() if role not in again}, ("inputs",), description)
     values = description.select(mapping.parameters, "parameters", None)

@@ -25,7 +25,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Delay, Names, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
@@ -114,14 +114,11 @@ class FmuWorld(World):
             make = partial(open_instance, description, mapping.tolerance, mapping.debug_log)
             self._instances.open(prod(self.lead), make, self._lane)
             self._initialise()
-            self._refuse_faults()
+            for fault in self.faults.values():
+                raise fault  # noqa: TRY301 - the instances are closed below
         except BaseException:
             self.close()
             raise
-
-    def _refuse_faults(self) -> None:
-        for fault in self.faults.values():
-            raise fault
 
     def _connect(self, mapping: FmuMapping) -> None:
         """Make the ports; those of parameters are used outside the loop only."""
@@ -134,7 +131,6 @@ class FmuWorld(World):
         self._now = ctypes.c_double()
         parameters = dict(mapping.parameters)
         if mapping.home is not None and self._has_start:
-            self.description.find(mapping.home, "home")
             parameters[mapping.home] = self._start
         self._setters = setters(self.description, parameters, self.lead)
         self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
@@ -153,7 +149,7 @@ class FmuWorld(World):
         )
 
     def _port(self, role: str, names: Names) -> Port:
-        return Port(self.description.select(names, role), self.lead)
+        return Port(self.description.select(names, role, NUMERIC), self.lead)
 
     def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start; nothing here is random."""

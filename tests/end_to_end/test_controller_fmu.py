@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -15,7 +14,6 @@ from kit.fmpy_instance import Driven
 from kit.nightly import some
 from servobench.fmus.inspection import validate_fmu
 from servobench.fmus.trace.branches import leaves_of
-from servobench.fmus.trace.record import record
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import export as controller_fmu
 from servobench.harness.run.request import RunRequest
@@ -174,16 +172,13 @@ def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
 
 @pytest.mark.parametrize("begin", [0.0, 5.0])
 def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, begin):
-    def record_with_a_fault(*system):
-        made = record(*system)
+    recorded = controller_fmu._step
 
-        def step(x, u):
-            state, output, code = made.step(x, u)
-            return state, output + 1e-6 * (u[0] >= begin), code
+    def faulty(servo, state, inputs):
+        state, output = recorded(servo, state, inputs)
+        return state, output + 1e-6 * (inputs["time"] >= begin)
 
-        return replace(made, step=step)
-
-    monkeypatch.setattr(controller_fmu, "record", record_with_a_fault)
+    monkeypatch.setattr(controller_fmu, "_step", faulty)
     with pytest.raises(ConfigurationError, match="over 5 periods it would differ from the original by 1e-06, allowed"):
         controller_fmu.controller_model(RunRequest("kinematic", "cfdl_mfac:published", "target", "none", 0), Settings())
 

@@ -41,6 +41,14 @@ def test_parameters_of_every_type_reach_the_fmu_before_every_run(tmp_path, versi
     np.testing.assert_allclose(motion, factor * 0.05 * np.array([0.1, 0.2]), rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.parametrize("on", [True, False])
+def test_features_are_seen_where_an_fmu_says_true(tmp_path, on):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    world = FmuWorld(FmuMapping(path, **ROLES[2], seen=("on", "on"), parameters={"on": np.array(on)}), None, 0.05)
+    assert world.visible().tolist() == [on, on]
+    world.close()
+
+
 def test_a_file_gives_truth_values_and_texts(tmp_path):
     build_crane(tmp_path / "crane.fmu", 3)
     text = 'file = "crane.fmu"\ninputs = "push"\nfeatures = "place"\n[parameters]\non = true\nmood = "x"\ngear = 2\n'
@@ -96,11 +104,12 @@ def test_a_structural_parameter_that_leaves_no_feature_is_one_clear_line(tmp_pat
         (2, {"quirk": np.array("heavy")}, "'quirk' is of type Real: wanted a number, got 'heavy'"),
         (3, {"samples": -1.0}, "'samples' is of type UInt64: wanted a whole number from 0 to"),
         (3, {"arm": np.array([1.0, 2.0, 3.0])}, "'arm' must have 2 values, got 3"),
+        (2, {"wheel.slew": 1.0}, "names 'wheel.slew', which takes no value; wanted a parameter or a start value"),
     ],
 )
 def test_a_value_of_another_type_is_one_clear_line(tmp_path, version, parameters, message):
     path = build_crane(tmp_path / "crane.fmu", version)
-    with pytest.raises(ValueError, match=f"parameter {message}"):
+    with pytest.raises(ValueError, match=f"parameters? {message}"):
         moved(path, version, parameters=parameters)
 
 

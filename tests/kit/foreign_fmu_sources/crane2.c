@@ -83,6 +83,12 @@ int fmi2GetReal(void *component, const unsigned *references, size_t n, double *v
     return 0;
 }
 
+int fmi2GetBoolean(void *component, const unsigned *references, size_t n, int *values)
+{
+    for (size_t i = 0; i < n; i++) values[i] = ((Crane *)component)->on;
+    return 0;
+}
+
 int fmi2GetRealStatus(void *c, int kind, double *value)
 {
     *value = ((Crane *)c)->time;
@@ -192,5 +198,4 @@ int fmi2GetDirectionalDerivative(void *component, const unsigned *unknowns, size
     int name(void *c, const unsigned *references, size_t n, type values) { return 0; }
 
 UNUSED(fmi2GetInteger, int *)
-UNUSED(fmi2GetBoolean, int *)
 UNUSED(fmi2GetString, const char **)
