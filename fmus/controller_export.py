@@ -116,6 +116,5 @@ class ControllerModel:
 
     def _reference(self, layout: Layout) -> tuple[str, str]:
         """Return the run as CSV; the outputs at an instant, before its inputs, are those of the last one."""
-        rows = {each.name: self.run[each.name] for each in layout.of_role(SAMPLED)}
-        before = {name: np.vstack([np.zeros_like(part[:1]), part[:-1]]) for name, part in rows.items()}
+        before = {name: np.pad(self.run[name][:-1], ((1, 0), (0, 0))) for name in (COMMAND, JACOBIAN)}
         return tables({**self.run, **before}, layout)

@@ -59,8 +59,6 @@ const char *core_check_stop_time(const Core *core)
 }
 
 #define NO_SUCH_VARIABLE "there is no variable with this value reference"
-#define TOO_FEW "too few values for these variables"
-#define TOO_MANY "too many values for these variables"
 
 /* Whether variables exist, begin below `end` and have as many values as there is room for. */
 static const char *check(Variables variables, size_t end, const char *missing)
@@ -71,7 +69,8 @@ static const char *check(Variables variables, size_t end, const char *missing)
         if (size == 0 || variables.references[i] >= end) return missing;
         k += size;
     }
-    return k < variables.n_values ? TOO_MANY : k > variables.n_values ? TOO_FEW : NULL;
+    if (k < variables.n_values) return "too many values for these variables";
+    return k > variables.n_values ? "too few values for these variables" : NULL;
 }
 
 static const char *get_value(Core *core, size_t index, double *value)

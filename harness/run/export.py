@@ -150,13 +150,13 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
     controller, spec = experiment.controller, experiment.plant.spec
     length = LoopSettings(experiment.periods, experiment.run.preview_rows)
     rollout = begin(experiment.plant, controller, experiment.desired(), length, (0, 0))
-    unknown = np.zeros(spec.m * spec.n)
+    unknown = np.zeros((spec.m, spec.n))
     rows, states = [], []
     try:
         for period in islice(periods(rollout, controller), REFERENCE_PERIODS):
             observation, estimate = period.observation, controller.estimated_jacobian()
             given = observation.joint_position, observation.feature, observation.valid, np.ravel(period.reference)
-            answers = period.command.joint_velocity, unknown if estimate is None else np.ravel(estimate)
+            answers = period.command.joint_velocity, np.ravel(unknown if estimate is None else estimate)
             rows.append((observation.time, *given, *answers))
             states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
     except RunFault as fault:
