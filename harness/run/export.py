@@ -112,7 +112,7 @@ def _repeated_periods(recorded: Recorded, inputs: FloatArray, outputs: FloatArra
         """Return that of each period, (k,), as `fmu validate` counts it; a stretch begins at the original's state."""
         came, state = np.empty_like(outputs), states[0]
         for k, row in enumerate(inputs):
-            state, output, _ = recorded.step(state if k % stretch else states[k], row)
+            state, output, _ = recorded.step(state if k % stretch else states[k // STRETCH], row)
             came[k] = np.asarray(output).reshape(-1)
         return np.asarray((np.abs(came - outputs) / np.maximum(1.0, np.abs(outputs))).max(axis=1))
 
@@ -122,7 +122,7 @@ def _repeated_periods(recorded: Recorded, inputs: FloatArray, outputs: FloatArra
     if not (largest := differences(STRETCH).max()) <= TOLERANCE:
         allowed = f"allowed is {TOLERANCE:g}: take another method, sensing or robot"
         raise NotTraceable(f"over {STRETCH} periods it would differ from the original by {largest:.1g}, {allowed}")
-    return max(STRETCH, int(np.argmax(whole > 0.1 * TOLERANCE)))
+    return max(STRETCH, int(np.argmin(whole <= 0.1 * TOLERANCE)))
 
 
 def _observation(inputs: Mapping[str, Any]) -> Observation:
@@ -145,7 +145,7 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
     No camera is moved, and lost features do not end it.
 
     Returns:
-        Time, inputs and outputs by name, (k, size), and the numbers of the state after each period.
+        Time, inputs and outputs by name, (k, size), and the numbers of the state after every `STRETCH` periods.
     """
     controller, spec = experiment.controller, experiment.plant.spec
     length = LoopSettings(experiment.periods, experiment.run.preview_rows)
@@ -158,7 +158,8 @@ def _run(experiment: Experiment) -> tuple[dict[str, FloatArray], list[FloatArray
             given = observation.joint_position, observation.feature, observation.valid, np.ravel(period.reference)
             answers = period.command.joint_velocity, np.ravel(unknown if estimate is None else estimate)
             rows.append((observation.time, *given, *answers))
-            states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
+            if len(rows) % STRETCH == 0:
+                states.append(np.hstack([*map(np.ravel, leaves_of(controller.save()))]))
     except RunFault as fault:
         if not rows:
             raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
