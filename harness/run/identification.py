@@ -53,7 +53,8 @@ ARM: Final = ("gear", "zero", "link", "tool")
 MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
 FASTEST: Final = 1.5  # [1] speed of a joint over its limit at most
 MAX_JUMP: Final = 0.05  # [rad] from row to row, beyond this speed
-MAX_REPEATED: Final = 0.02  # [1] share of frames that equal another one although the arm moves
+LARGE: Final = 2.5  # [1] of the least change of a feature, which is 1 where a detector finds whole pixels
+MAX_REPEATED: Final = 0.01  # [1] share of frames that equal another one although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
 TURNINGS: Final = np.radians(np.arange(0.0, 31.0))  # [rad/s] of the first search
@@ -113,7 +114,12 @@ class Log(NamedTuple):
         """Name frames given as new that equal the one before, or are all the same, although the arm moves."""
         rows = np.flatnonzero(self.valid)
         _, kinds, counts = np.unique(self.features[rows], axis=0, return_inverse=True, return_counts=True)
-        same = (np.diff(kinds) == 0) | (counts[kinds[1:]] > MAX_REPEATED * len(rows))  # as 0 stands for no frame
+        steps = np.abs(np.diff(self.features[rows], axis=0))
+        changed, least = steps.any(axis=1), np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
+        large = (steps > LARGE * least).any(axis=1)[changed]
+        jumps = np.append(False, large) | np.append(large, True)  # into or out of equal frames, no single whole pixel
+        repeated = ~changed | (counts[kinds[1:]] > MAX_REPEATED * len(rows))  # as 0 stands for no frame
+        same = repeated & jumps[np.cumsum(changed)]
         moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
         share = float(np.mean(same[moving])) if moving.any() else 0.0
         if share <= MAX_REPEATED:

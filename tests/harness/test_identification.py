@@ -318,6 +318,17 @@ def test_outliers_and_a_joint_at_rest_are_no_mistakes():
     assert np.sqrt(np.diag(robot.noise)).max() < 0.0015
 
 
+@pytest.mark.parametrize("pixel", [0.01, 0.02])
+def test_equal_frames_of_a_detector_of_whole_pixels_are_no_mistake(pixel):
+    log = logged()[0]
+    coarse = log._replace(features=np.round(log.features / pixel) * pixel)
+    assert (np.diff(coarse.features, axis=0) == 0.0).all(axis=1).mean() > 0.02
+    assert coarse.frame_mistake() == ""
+    assert "frames repeat another one" in zeros(coarse).frame_mistake()
+    coarse.features[100:140] = coarse.features[100]
+    assert "frames repeat another one" in coarse.frame_mistake()
+
+
 def test_what_is_printed_names_units_and_what_the_log_does_not_tell():
     log, _, _ = logged()
     still = log._replace(joints=log.joints * (1, 1, 1, 1, 1, 0.0))
