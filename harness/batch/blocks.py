@@ -129,7 +129,7 @@ def carry_out_blocks(
             _carry_out(block, results.append, steps, keep, debug)
             yield block, results
         return
-    waiting, again = iter(blocks), deque[Block]()
+    waiting, again, suspects = iter(blocks), deque[Block](), deque[Block]()
     finished: SimpleQueue[tuple[Block, Any]] = SimpleQueue()
     under_way, most = 0, TASKS_PER_WORKER * workers.count
     while True:
@@ -137,12 +137,16 @@ def carry_out_blocks(
             future = workers.submit(_task(_carry_out_there, given, steps, keep))
             future.add_done_callback(lambda done, block=given: finished.put((block, done)))
             under_way += 1
-        if not under_way:
+        if not under_way and not suspects:
             return
+        if not under_way:
+            again.append(suspects.popleft())  # alone: a worker may die of any of its tasks
+            continue
         block, future = finished.get()
         under_way -= 1
         done, rest = _outcome(block, future, workers)
-        again.extend(rest)
+        for each in rest:
+            (suspects if each.fresh and workers.lost else again).append(each)
         if done:
             yield block.part(0, len(done)), done
 
@@ -152,7 +156,7 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     try:
         answer = _received(future)
     except workers.lost:
-        answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
+        answer = Answer([], End(Ending(CRASHED, LOST), certain=False))
     match answer.items:
         case [{"unreadable": [str(status), str(reason), str(trace)]}]:
             return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
@@ -165,7 +169,7 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     if end is None or len(done) == len(block.jobs):
         return done, []
     single = replace(block, together=False)
-    if not done and len(block.jobs) > 1 and block.together:
+    if not done and len(block.jobs) > 1 and (block.together or workers.lost):
         return [], [single.part(at, at + 1) for at in range(len(block.jobs))]
     at = len(done)
     rest = [single.part(at + 1)] if at + 1 < len(block.jobs) else []
