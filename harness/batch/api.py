@@ -17,6 +17,7 @@ from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import MAX_SEEDS, Batch, Cell, Grid, check_seeds, refuse_tuning_seeds
 from servobench.harness.batch.processes import Bounds
+from servobench.harness.batch.sandbox import leaving_unguarded_script
 from servobench.harness.config.registry import can_travel, choose_controller, choose_plant, offered, offering
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
@@ -151,7 +152,7 @@ def compare(
         remark("isolate has no effect with an executor: nothing limits the runs in its processes")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
-    with offering():
+    with offering(), leaving_unguarded_script():
         names = tuple(choose_controller(each) for each in controllers)
         worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))

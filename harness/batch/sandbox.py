@@ -48,6 +48,7 @@ TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
 MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
 KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
+GUARD: Final = "servobench guard"  # name of its process
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
 
 Tell: TypeAlias = Callable[[Any], None]  # passes an answer of JSON values up; None is only a sign of life
@@ -239,7 +240,7 @@ class Sandbox:
         inherited = (ours,) if self._copied else ()
         tracker = getattr(resource_tracker._resource_tracker, "_pid", None)  # Python does not tell it otherwise
         arguments = (self._modules, __name__, "keep_guard", theirs, self._limits, inherited, tracker)
-        process: BaseProcess = context.Process(target=processes.begin, args=arguments)
+        process: BaseProcess = context.Process(target=processes.begin, name=GUARD, args=arguments)
         with self._lock:
             if self._ended:
                 raise EOFError
@@ -272,6 +273,17 @@ class Sandbox:
             "the worker processes cannot be started; a script that starts some must be a file and keep its calls "
             "below `if __name__ == '__main__':`"
         )
+
+
+@contextlib.contextmanager
+def leaving_unguarded_script() -> Iterator[None]:
+    """End a guard in silence if the script that it imports wants workers, too: the process above says why not."""
+    try:
+        yield
+    except (ConfigurationError, RuntimeError):  # the latter of multiprocessing
+        if current_process().name == GUARD and getattr(current_process(), "_inheriting", False):
+            sys.exit(START_ERROR)
+        raise
 
 
 @contextlib.contextmanager
