@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +42,7 @@ class Export:
     @contextlib.contextmanager
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
-        with configuration_errors(), accessing(Path(tempfile.gettempdir())):
+        with configuration_errors(), accessing(None):
             yield parse_platforms(self.platforms)
 
     def request(self, controller: str, settings: Settings) -> RunRequest:

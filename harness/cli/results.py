@@ -122,10 +122,11 @@ def figures(
     say(results.describe_missing(folder))
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
-    with console.status("drawing the figures"), accessing(target):
-        files: list[Path] = []
+    files: list[Path] = []
+    with console.status("drawing the figures"):
         for named in folder_figures(folder, choice):
-            files += save_figure(named.figure, target / named.stem, formats, exact_width=True)
+            with accessing(target):
+                files += save_figure(named.figure, target / named.stem, formats, exact_width=True)
     if not files:
         results.check_steps(folder)
         raise ConfigurationError(

@@ -36,8 +36,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         partial.replace(path)
         sync(path.parent)
     except OSError as error:
-        if error.errno is not None:
-            error.filename = str(path)  # that of the user: a full disk names no file, other errors the partial one
+        if error.errno is not None and str(error.filename or partial) == str(partial):  # a full disk names no file
+            error.filename = str(path)  # that of the user
         raise
     finally:
         if partial.exists():  # not below a file, for instance
@@ -46,11 +46,19 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 @contextmanager
 def accessing(path: Path | None, kind: str = "", done: str = "written") -> Iterator[None]:
-    """Raise a `ConfigurationError` where a file or folder of a kind, or by default a file in it, cannot be `done`."""
+    """Raise a `ConfigurationError` where a file or folder of a kind, or by default a file in it, cannot be `done`.
+
+    It names another file that was read meanwhile and cannot be. Without a path, any file may be the one.
+    """
     try:
         yield
     except OSError as error:
-        named = f"{kind} {path}" if kind else error.filename or path
+        file = Path(str(error.filename or path))
+        if path is not None and done == "written" and path not in (file, *file.parents) and file not in path.parents:
+            raise ConfigurationError(f"{file}, which {path} needs, cannot be read: {reason(error)}") from error
+        if done == "written" and error.errno is None:  # none of the system, as of a library that draws
+            raise
+        named = f"{kind} {path}" if kind else error.filename or path or "a temporary file"
         raise ConfigurationError(f"{named} cannot be {done}: {reason(error)}") from error
 
 

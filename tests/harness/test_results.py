@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from kit.command import servobench
 from kit.folders import comparison, made_up_row, made_up_steps, sweep, write_folder
@@ -35,7 +36,7 @@ from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import point_latest, write_atomically
+from servobench.plant.contract.files import accessing, point_latest, write_atomically
 
 STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}
 
@@ -249,6 +250,17 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OSError, match="Not a directory"):
         write_atomically(path / "page", lambda _: pytest.fail("its content is made although it cannot be kept"))
+
+
+def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_written(tmp_path):
+    page, font = tmp_path / "out" / "page", tmp_path / "a.ttf"
+    page.parent.mkdir()
+    for path, kind in ((page, "report"), (page.parent, "")):
+        line = f"^{font}, which {path} needs, cannot be read: No such file or directory$"
+        with pytest.raises(ConfigurationError, match=line), accessing(path, kind):
+            write_atomically(page, lambda _: font.read_bytes())
+        with pytest.raises(OSError, match="cannot identify"), accessing(path, kind):
+            write_atomically(page, Image.open)
 
 
 def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
