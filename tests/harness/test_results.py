@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +37,7 @@ from servobench.harness.pictures.tracks import load_ensembles, load_groups
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.checksums import SUMS, write_vouched
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, point_latest, write_atomically
+from servobench.plant.contract.files import accessing, partial_path, point_latest, write_atomically
 
 STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}
 
@@ -250,6 +251,21 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OSError, match="Not a directory"):
         write_atomically(path / "page", lambda _: pytest.fail("its content is made although it cannot be kept"))
+
+
+def test_a_file_and_its_name_are_on_the_disk_before_the_next_is_written(tmp_path, monkeypatch):
+    kept: list[str] = []
+    sync = os.fsync
+
+    def note(descriptor):
+        kept.append(f"{os.fstat(descriptor).st_ino} {[each.name for each in tmp_path.iterdir()]}")
+        sync(descriptor)
+
+    monkeypatch.setattr("os.fsync", note)
+    write_atomically(tmp_path / "table", lambda file: file.write_text("new"))
+    partial = partial_path(tmp_path / "table").name
+    inodes = (tmp_path / "table").stat().st_ino, tmp_path.stat().st_ino
+    assert kept == [f"{inodes[0]} {[partial]}", f"{inodes[1]} {['table']}"]
 
 
 def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_written(tmp_path):
