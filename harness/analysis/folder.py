@@ -26,7 +26,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    manifest, runs = results.read_manifest(folder), name_twins(folder, runs)
+    manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
     described = {name: (name, 1.0) for name in DESCRIBED if name in runs} | varied_columns(runs.columns)
@@ -39,11 +39,16 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     return facts | {"seeds": _seeds(runs["seed"].tolist()), "made": made}
 
 
-def name_twins(folder: Path, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a folder's runs for titles: the mismatch of robots that were drawn from a twin, which is none, says so."""
-    robots = results.read_manifest(folder).get("robots") or ()
-    drawn = any(str(each.get("title")).endswith(" twin") for each in robots)
-    return runs.replace({"mismatch": {"none": FROM_TWIN}}) if drawn else runs
+def titled_runs(folder: Path) -> pd.DataFrame:
+    """Return a folder's runs for titles: the mismatch of robots that were drawn from a twin, which is none, says so.
+
+    Raises:
+        ConfigurationError: as for `results.load_runs`.
+    """
+    runs, robots = results.load_runs(folder), results.read_manifest(folder).get("robots") or ()
+    twins = [each.get("name") for each in robots if str(each.get("title")).endswith(" twin")]
+    drawn = (runs["mismatch"] == "none") & runs.get("robot", runs["mismatch"]).isin(twins)
+    return runs.assign(mismatch=runs["mismatch"].mask(drawn, FROM_TWIN))
 
 
 def describe_controllers(folder: Path) -> str:

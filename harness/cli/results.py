@@ -42,13 +42,13 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.folder import describe_controllers, latex_tables, methods_paragraph, name_twins
+    from servobench.harness.analysis.folder import describe_controllers, latex_tables, methods_paragraph, titled_runs
     from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
     if markdown + latex + as_json > 1:
         raise ConfigurationError("--markdown, --latex and --json are ways to print the same; give one of them")
-    runs = name_twins(folder, results.load_runs(folder))
+    runs = titled_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
         sys.stderr.write(f"{missing}\n" * bool(missing))

@@ -163,7 +163,7 @@ def _carry_out(
     campaign: Campaign, out: Path | None, how: Execution, *, with_figures: bool, with_report: bool, strict: bool
 ) -> None:
     """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
-    from servobench.harness.analysis.folder import describe_controllers, name_twins
+    from servobench.harness.analysis.folder import describe_controllers, titled_runs
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
@@ -173,8 +173,8 @@ def _carry_out(
     folder = out or new_folder()
     with watching(console, folder, how) as watched:
         carry_out(campaign, folder, watched)
-        runs = results.load_runs(folder)
-        print_tables(summary_tables(name_twins(folder, runs)), summary_legend(runs))
+        runs = titled_runs(folder)
+        print_tables(summary_tables(runs), summary_legend(runs))
         say(describe_controllers(folder))
         print_faults(folder, runs)
         if out is None:

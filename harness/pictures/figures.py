@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
-from servobench.harness.batch import results
+from servobench.harness.analysis.folder import titled_runs
 from servobench.harness.pictures.measures import FIGURES, draw_conditions, draw_measures, draw_step_times
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import (
@@ -101,7 +101,7 @@ def folder_figures(folder: Path, choice: Choice = Choice()) -> Iterator[NamedFig
     Raises:
         ConfigurationError: not a results folder.
     """
-    runs = results.load_runs(folder)
+    runs = titled_runs(folder)
     styles = method_styles(runs["controller"].tolist())
     if choice.names is not None:
         runs = runs[runs["controller"].isin(list(choice.names))]

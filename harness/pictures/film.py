@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
+from servobench.harness.analysis.comparison import FROM_TWIN
 from servobench.harness.config.installation import missing_extra
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.responses import mark_settling_band
@@ -306,4 +307,5 @@ def _title(run: LoggedRun) -> str:
     row = run.track.row
     robot = str(row.get("robot", DEFAULT_ROBOT))
     arm = "" if robot == DEFAULT_ROBOT else f", {short_name(robot)}"
-    return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {row['mismatch']}, seed {row['seed']}"
+    mismatch = FROM_TWIN if run.robot.twin and row["mismatch"] == "none" else row["mismatch"]
+    return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {mismatch}, seed {row['seed']}"

@@ -20,7 +20,7 @@ from markupsafe import Markup, escape
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import comparison, tables
 from servobench.harness.analysis.comparison import MISSING
-from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, name_twins
+from servobench.harness.analysis.folder import describe_controllers, describe_folder, describe_settings, titled_runs
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.pictures.figures import KINDS, page_figures
@@ -78,7 +78,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     Raises:
         ConfigurationError: not a results folder, no run in it, or the page cannot be written.
     """
-    runs = name_twins(folder, results.load_runs(folder))
+    runs = titled_runs(folder)
     if runs.empty:
         raise ConfigurationError(f"{folder} holds no finished run")
     target = path or folder / NAME

@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import POINT_TO_POINT, column_of, handy_unit, settling_times, with_places
-from servobench.harness.analysis.folder import name_twins
 from servobench.harness.batch import results
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
@@ -140,7 +139,7 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    for (plant, mismatch), group in with_places(name_twins(folder, runs)).groupby(["plant", "mismatch"], sort=False):
+    for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         tasks: dict[str, Tracks] = {}
         for track in load_tracks(folder, chosen):

@@ -8,10 +8,10 @@ import pytest
 
 from kit.command import carried_out, servobench
 from kit.folders import sweep
-from servobench.harness.analysis.folder import describe_folder, latex_tables, methods_paragraph, name_twins
+from servobench.harness.analysis.folder import describe_folder, latex_tables, methods_paragraph, titled_runs
 from servobench.harness.analysis.tables import statistics_tables
 from servobench.harness.batch.api import compare
-from servobench.harness.batch.results import load_runs
+from servobench.harness.batch.results import load_runs, load_steps
 from servobench.harness.pictures.figures import Choice, folder_figures
 
 TABLE = pd.DataFrame(
@@ -78,14 +78,18 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
         settings={"exp2": {"duration": 0.5}},
         out=out,
     )
-    text = methods_paragraph(out, load_runs(out))
+    runs = titled_runs(out)
+    text = methods_paragraph(out, runs)
     assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text
     (drawn,) = folder_figures(out, Choice(["errors"]))
     assert drawn.title.endswith("kinematic, mismatch drawn from the twin, seed 0")
-    assert describe_folder(out, load_runs(out))["mismatch"] == "drawn from the twin"
-    assert [title for title, _ in statistics_tables(name_twins(out, load_runs(out)))] == [
-        "exp2 on kinematic, drawn from the twin"
-    ]
+    assert describe_folder(out, runs)["mismatch"] == "drawn from the twin"
+    assert [title for title, _ in statistics_tables(runs)] == ["exp2 on kinematic, drawn from the twin"]
+    pytest.importorskip("cv2")
+    from servobench.harness.pictures import film, replay
+
+    shown = replay.logged_run(load_runs(out).to_dict("records")[0], load_steps(out))
+    assert film._title(shown).endswith("mismatch drawn from the twin, seed 0")
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX")
