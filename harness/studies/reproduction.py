@@ -116,7 +116,8 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
         ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
         axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
     axes.grid(visible=True, alpha=0.3)
-    axes.legend(fontsize=7, frameon=False)
+    if axes.get_legend_handles_labels()[0]:  # none where no run gives a number, as moves too short to settle
+        axes.legend(fontsize=7, frameon=False)
 
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:

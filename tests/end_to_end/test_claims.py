@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from kit.command import no_file_above
+from servobench.harness.analysis.comparison import NO_ESTIMATE
 from servobench.harness.batch.plan import TUNING
 from servobench.harness.config.settings import Settings
 from servobench.harness.studies import claims, reproduction
@@ -248,6 +249,13 @@ def test_every_answer_is_in_the_table():
     answers = answer_all(tables(), "kinematic")
     assert len(answers) == 9
     assert markdown_table(answers).count("\n") == 11
+
+
+def test_an_answer_without_a_number_is_drawn_as_png_and_pdf(tmp_path):
+    answer = answer_all(tables(), "kinematic")[0]
+    unknown = tuple(replace(each, estimate=NO_ESTIMATE) for each in answer.measurements)
+    reproduction.draw_answers([replace(answer, measurements=unknown)], tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"claim_1.png", "claim_1.pdf"}
 
 
 def test_no_study_uses_a_seed_that_methods_were_tuned_on():
