@@ -122,8 +122,11 @@ def options_table() -> str:
                 words = "`" + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip() + "`"
                 owners.setdefault((words, option.help.replace("\\[", "[").replace("<", "\\<")), []).append(name)
     several = {words.removesuffix("S`") + "`" for words, _ in owners}  # the list of a name says the same
-    rows = [key for key, names in owners.items() if len(names) > 1 and key[0] not in several]
-    return table(("option", "meaning"), rows)
+    meanings: dict[str, list[str]] = {}
+    for (words, meaning), names in owners.items():
+        if len(names) > 1 and words not in several:
+            meanings.setdefault(words, []).append(meaning)
+    return table(("option", "meaning"), [(words, " Or: ".join(each)) for words, each in meanings.items()])
 
 
 def methods_table() -> str:

@@ -202,7 +202,7 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
     if request.mismatch != Mismatch():
         raise ConfigurationError(f"{brings} robot of its own, to which mismatches do not apply; use the mismatch none")
     if request.sensing != DEFAULT_SENSING:
-        raise ConfigurationError(f"{brings} sensor of its own, so --sensing {request.sensing} does not apply")
+        raise ConfigurationError(f"{brings} sensor of its own, so the sensing {request.sensing} does not apply")
     plant, controller, networks = _assemble(resolved, None, None, progress)
     try:
         setting = TaskSetting(None, plant.spec.n, plant.spec.feature, named_seed(request.seed, "task"))
@@ -234,7 +234,7 @@ def _assemble(
     """
     request, run, entry = resolved.request, resolved.run, find_plant(resolved.request.plant)
     if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
-        raise ConfigurationError(f"plant {entry.name} has the sensing position only, got --sensing {request.sensing}")
+        raise ConfigurationError(f"plant {entry.name} has the sensing position only, got {request.sensing}")
     robot = None if entry.own_robot else find_robot(request.robot)
     setup = PlantSetup(true, start, run.period, robot)
     with configuration_errors(f"plant {request.plant}: ", RunFault):
@@ -313,10 +313,10 @@ def _check_features(run: ResolvedRun, experiment: Experiment) -> None:
         remark(f"{task} moves at {speed:.3g} {unit}/s, and the arm at {most:.3g} {unit}/s at most from its start")
     own = sensing_file(run.request.sensing) is not None
     if own and len(np.unique([*J.round(9), np.zeros(spec.n)], axis=0)) <= spec.m:
-        remark(f"--sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
+        remark(f"sensing {run.request.sensing}: a feature stands still, or moves as another one does, at the start")
     size, (least, most) = float(np.linalg.norm(J)), RATES.get(unit, (0.0, np.inf))
     if own and not least <= size <= most:
-        remark(f"--sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?")
+        remark(f"sensing {run.request.sensing}: features move by {size:.2g} {unit}/rad; is {unit} their unit?")
 
 
 def train_networks(

@@ -124,7 +124,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass
     name, camera = entry.name, robot.camera
     if entry.own_robot and robot.name != DEFAULT_ROBOT:
-        raise ConfigurationError(f"plant {name} brings a robot of its own, so --robot {robot.name} does not apply")
+        raise ConfigurationError(f"plant {name} brings a robot of its own, so the robot {robot.name} does not apply")
     if camera is not None and (entry.own_robot or not entry.any_sensing):
         raise ConfigurationError(f"plant {name} brings a camera of its own, so --camera {camera.name} does not apply")
     config: Any = entry.config() if entry.config_for is None else entry.config_for(robot)

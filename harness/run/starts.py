@@ -142,7 +142,7 @@ class PoseTask(Task):
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
         if not (isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel) and true.setup.judges_pose):
-            raise ValueError("it needs a target with a pose; use --sensing plate or plate:hand")
+            raise ValueError("it needs a target with a pose; use the sensing plate or plate:hand")
         start = pose_start(self, robot, setting.nominal)
         return setting.move(start, setting.taught(robot.workspace.home), self.duration)
 

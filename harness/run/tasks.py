@@ -58,7 +58,9 @@ class PointTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        start, target = (as_vector(name, getattr(self, name), setting.n) for name in ("start", "target"))
+        start, target = (
+            as_vector(f"its setting {name}", getattr(self, name), setting.n) for name in ("start", "target")
+        )
         robot, true = setting.taught_on()
         if self.into_view and isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
             start, target = drawn_together(start, target, robot, setting.nominal, true)
@@ -89,7 +91,7 @@ class TargetTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        target = as_vector("target", self.target, setting.m)
+        target = as_vector("its setting target", self.target, setting.m)
         return setting.move(self.start, setting.followed(FixedPoint(target)), self.duration)
 
 
@@ -115,7 +117,7 @@ class RandomTask(Task):
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
         n, clear = robot.n, robot.workspace.clear
-        lower, upper = as_vector("lower", self.lower, n), as_vector("upper", self.upper, n)
+        lower, upper = (as_vector(f"its setting {name}", getattr(self, name), n) for name in ("lower", "upper"))
         if not (lower < upper).all():
             raise ValueError("lower must be below upper for every joint")
         generator = named_generator(setting.seed, "start_and_target")
@@ -167,7 +169,7 @@ class CurveTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        centre, scale = as_vector("centre", self.centre, setting.m), 1.0
+        centre, scale = as_vector("its setting centre", self.centre, setting.m), 1.0
         if setting.robot is not None:
             scale = setting.robot.workspace.scale
         radius = scale * RADII[self.curve] if self.radius is None else self.radius
@@ -203,7 +205,7 @@ class LineTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        begin, end = (as_vector(name, getattr(self, name), setting.m) for name in ("begin", "end"))
+        begin, end = (as_vector(f"its setting {name}", getattr(self, name), setting.m) for name in ("begin", "end"))
         reference = setting.followed(line(begin, end, self.moving))
         return Scenario(setting.start(self.start), reference, self.duration, 0.5 * self.duration)
 
@@ -226,7 +228,7 @@ class WaypointTask(Task):
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         if not self.file:
-            raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
+            raise ValueError("it needs a CSV file, the setting waypoints.file")
         reference = read_waypoints(user_path(self.file), setting.feature)
         duration = float(reference.times[-1]) + self.settle
         check_number("last waypoint's time plus settle", duration, above=0.0)

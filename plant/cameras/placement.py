@@ -121,7 +121,7 @@ def _check_fit(camera: OwnCamera, setup: SensingSetup, mount: Mount) -> None:
     on, off = ("flange", "base") if mount == "hand" else ("base", "flange")
     if camera.keys.pose.frame == off:
         other = setup.name if mount == "hand" else f"{setup.name}:hand"
-        raise ValueError(f"camera {name} is on the {off}; use --sensing {other}")
+        raise ValueError(f"camera {name} is on the {off}; use the sensing {other}")
     if camera.keys.target.frame == on:
         raise ValueError(f"camera {name}: the target must be on the {off} where the camera is on the {on}")
     if (camera.second is None) != (setup.cameras == 1):

@@ -72,9 +72,9 @@ class Sensing:
         """
         for axis, _ in mismatch.axes:
             if axis in OPTICAL and self.setup.name == POSITION.name:
-                raise ValueError(f"mismatch axis {axis} needs a camera that sees pixels, such as --sensing pixel")
+                raise ValueError(f"mismatch axis {axis} needs a camera that sees pixels, such as the sensing pixel")
             if axis == ON_HAND and self.mount != HAND:
-                raise ValueError(f"mismatch axis {axis} needs a camera on the hand, such as --sensing pixel:{HAND}")
+                raise ValueError(f"mismatch axis {axis} needs a camera on the hand, such as the sensing pixel:{HAND}")
         if self._is_plain(robot):
             return true, None
         draws = draw_cameras(mismatch, self.setup.cameras, seed)

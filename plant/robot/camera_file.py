@@ -185,7 +185,7 @@ def frame_time(what: str, rate: float, period: float) -> float:
         return round(1.0 / frames) * period
     if abs(round(whole / period) * period - whole) > ROUNDED * period:
         clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
-        remark(f"{what}: {clocks}, so delays change; --set run.period={1e3 * whole:g}ms helps")
+        remark(f"{what}: {clocks}, so delays change; run.period={1e3 * whole:g}ms helps")
     return whole
 
 

@@ -125,7 +125,9 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
     title, deviation = nearest_title(arm)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
         other = f"that of a {title} (lengths within {1e3 * deviation:.1f} mm), and the robot is a {robot.title}"
-        raise ValueError(f"calibration file {file} is {other}; use --robot {title.lower()}, or --robot {file}")
+        raise ValueError(
+            f"calibration file {file} is {other}; use the robot {title.lower()}, or {file} itself as the robot"
+        )
     return arm
 
 

@@ -105,7 +105,7 @@ class MechanicsConfig:
             ValueError: says so.
         """
         if self.tool_frequency > 0.0 and model.channel is not FEATURE:
-            raise ValueError("mechanics.tool_frequency needs --sensing position; leave it at 0 with other sensing")
+            raise ValueError("mechanics.tool_frequency needs the sensing position; leave it at 0 with other sensing")
 
 
 def transmitted(q: FloatArray, ripple: float | FloatArray, order: float) -> FloatArray:

@@ -156,7 +156,7 @@ class Twin:
             ValueError: another sensing than that of the log, or a mismatch.
         """
         if sensing != self.keys.sensing:
-            raise ValueError(f"twin {self.path} was logged with --sensing {self.keys.sensing}, got {sensing}")
+            raise ValueError(f"twin {self.path} was logged with the sensing {self.keys.sensing}, got {sensing}")
         if not exact:
             words = "leave the mismatch out, and axes, but for camera_move and those of sensor, gears and tool"
             raise ValueError(f"twin {self.path} draws its robot from a posterior: {words}")

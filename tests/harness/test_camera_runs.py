@@ -110,7 +110,7 @@ def test_a_challenge_has_the_camera_of_a_file_beside_it(tmp_path):
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        (("--sensing", "pixel"), "camera mine.toml is on the flange; use --sensing pixel:hand"),
+        (("--sensing", "pixel"), "camera mine.toml is on the flange; use the sensing pixel:hand"),
         (("--sensing", "stereo:hand"), "sensing stereo has 2 cameras, and mine.toml describes 1"),
         (("--sensing", "position:hand"), "sensing.feature_noise is 0.5px, but the features are in m"),
         (("--camera", "aside.toml", "--sensing", "pixel", "--task", "exp2"),

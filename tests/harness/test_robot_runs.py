@@ -85,7 +85,7 @@ def test_the_manifest_says_which_arm_it_was(tmp_path):
 
 def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
     monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
-    with pytest.raises(ConfigurationError, match="brings a robot of its own, so --robot panda does not apply"):
+    with pytest.raises(ConfigurationError, match="brings a robot of its own, so the robot panda does not apply"):
         resolve(PANDA, Settings())
 
 

@@ -205,7 +205,7 @@ def test_a_start_out_of_view_is_a_run_without_a_feature():
 def test_a_plant_may_have_the_position_only(monkeypatch):
     entry = replace(find_plant("kinematic"), any_sensing=False)
     monkeypatch.setattr(experiment, "find_plant", lambda _: entry)
-    with pytest.raises(ConfigurationError, match="plant kinematic has the sensing position only, got --sensing pixel"):
+    with pytest.raises(ConfigurationError, match="plant kinematic has the sensing position only, got pixel"):
         build(resolve(request("pixel"), Settings({})))
 
 

@@ -264,4 +264,4 @@ def test_the_camera_and_the_controller_keep_time(write, caplog, rate, period, fr
     assert camera.sensing(SensingConfig(), period).frame_period == pytest.approx(frame, abs=1e-12)
     assert not caplog.text
     camera.sensing(SensingConfig(), 0.047)
-    assert "so delays change; --set run.period=" in caplog.text
+    assert "so delays change; run.period=" in caplog.text

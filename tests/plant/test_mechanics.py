@@ -124,7 +124,7 @@ def test_a_saved_state_keeps_play_and_tool():
 @pytest.mark.parametrize("name", ["kinematic", "fmu"])
 def test_a_flexible_tool_needs_the_ball_in_space(name):
     plate = find_sensing("plate").nominal(find_robot("ur5"))
-    with pytest.raises(ValueError, match="tool_frequency needs --sensing position"):
+    with pytest.raises(ValueError, match="tool_frequency needs the sensing position"):
         opened(name, plate, np.array(HOME), tool_frequency=12.0)
 
 

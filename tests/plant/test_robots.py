@@ -181,7 +181,7 @@ def test_a_calibrated_robot_is_held_against_its_data_sheet(tmp_path):
 
 def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
     path = write(tmp_path, calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1), "mine.yaml")
-    with pytest.raises(ValueError, match="is that of a UR10e .* the robot is a UR5; use --robot ur10e"):
+    with pytest.raises(ValueError, match="is that of a UR10e .* the robot is a UR5; use the robot ur10e"):
         sample_mismatch(Mismatch.parse(f"factory={path}"), find_robot("ur5"), 0)
     with pytest.raises(ValueError, match="which a Panda does not have"):
         sample_mismatch(Mismatch.parse("factory"), find_robot("panda"), 0)

@@ -175,7 +175,7 @@ def test_a_twin_has_no_mismatch_of_its_robot(twin, mismatch):
 
 
 def test_another_sensing_than_that_of_the_log_is_refused(twin):
-    with pytest.raises(ConfigurationError, match="was logged with --sensing position, got pixel"):
+    with pytest.raises(ConfigurationError, match="was logged with the sensing position, got pixel"):
         true_robot(twin, sensing="pixel")
 
 
