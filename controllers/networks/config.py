@@ -5,7 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 from annotated_types import Ge, Len, Lt
 
 from servobench.controllers.networks.rbf import STEP, Kernel
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
 
 Placement = Literal["halton", "sobol", "kmeans"]
@@ -108,4 +108,4 @@ class TrainingConfig:
         """
         if len(self.lower) != n:
             raise ValueError(f"lower and upper must name {n} joints, got {len(self.lower)}")
-        return as_vector("lower", self.lower, n), as_vector("upper", self.upper, n)
+        return as_array("lower", self.lower, (n,)), as_array("upper", self.upper, (n,))

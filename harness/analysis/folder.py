@@ -40,11 +40,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
 
 
 def titled_runs(folder: Path) -> pd.DataFrame:
-    """Return a folder's runs for titles: the mismatch of robots that were drawn from a twin, which is none, says so.
-
-    Raises:
-        ConfigurationError: as for `results.load_runs`.
-    """
+    """Return a folder's runs as `load_runs`, for titles: the mismatch none of robots drawn from a twin says so."""
     runs, robots = results.load_runs(folder), results.read_manifest(folder).get("robots") or ()
     twins = [each.get("name") for each in robots if str(each.get("title")).endswith(" twin")]
     drawn = (runs["mismatch"] == "none") & runs.get("robot", runs["mismatch"]).isin(twins)

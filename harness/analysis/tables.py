@@ -212,11 +212,6 @@ def _judged_parts(curves: Iterable[str]) -> str:
     return "; ".join(f"judged part of {', '.join(names)}: {part}" for part, names in parts.items())
 
 
-def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return the meaning of the words in `sweep_tables`, a line each."""
-    return f"{outcome_legend(parts)}\n{MISSING} as configured".lstrip()
-
-
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):

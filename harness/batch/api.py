@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from itertools import islice
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, TypeAlias
 
@@ -17,7 +18,7 @@ from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import MAX_SEEDS, Batch, Cell, Grid, check_seeds, refuse_tuning_seeds
 from servobench.harness.batch.processes import Bounds
-from servobench.harness.batch.sandbox import leaving_unguarded_script
+from servobench.harness.batch.sandbox import GUARD, START_ERROR
 from servobench.harness.config.registry import can_travel, choose_controller, choose_plant, offered, offering
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
@@ -152,7 +153,9 @@ def compare(
         remark("isolate has no effect with an executor: nothing limits the runs in its processes")
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
-    with offering(), leaving_unguarded_script():
+    if current_process().name == GUARD and (isolate or run_timeout or run_memory or workers != 1 or out is not None):
+        raise SystemExit(START_ERROR)  # it imports a script without a guard; the process above says what to do
+    with offering():
         names = tuple(choose_controller(each) for each in controllers)
         worlds = tuple(choose_plant(each) for each in plants)
         batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))

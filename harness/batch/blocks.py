@@ -36,16 +36,7 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
-from servobench.harness.config.registry import (
-    Offer,
-    can_travel,
-    find_controller,
-    find_plant,
-    is_foreign_controller,
-    is_foreign_plant,
-    offering,
-    own_modules,
-)
+from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
@@ -73,8 +64,8 @@ class Job:
     def owner(self) -> str:
         """Whose code the run carries out: the names of its plant and controller; empty for that of this package."""
         plant, controller = self.cell.request.plant, self.cell.request.controller
-        foreign = is_foreign_plant(plant, trusted=not getattr(self.run.plant, "isolate", True))
-        return f"{plant} {controller}" if foreign or is_foreign_controller(controller) else ""
+        foreign = registry.is_foreign_plant(plant, trusted=not getattr(self.run.plant, "isolate", True))
+        return f"{plant} {controller}" if foreign or registry.is_foreign_controller(controller) else ""
 
 
 @dataclass(frozen=True)
@@ -82,7 +73,7 @@ class Block:
     """Consecutive runs, and controllers and plants that users gave."""
 
     jobs: tuple[Job, ...]
-    own: tuple[Offer, ...] = ()
+    own: tuple[registry.Offer, ...] = ()
     together: bool = False  # whether the runs advance together
     fresh: bool = False  # whether they want a process in which no run has been
 
@@ -97,7 +88,7 @@ def even_size(count: int, workers: int, most: int = BLOCK) -> int:
     return math.ceil(count / (workers * max(rounds, 1)))
 
 
-def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[Offer, ...] = ()) -> Iterator[Block]:
+def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[registry.Offer, ...] = ()) -> Iterator[Block]:
     """Yield jobs in blocks of one kind, one owner and consecutive indices.
 
     Args:
@@ -230,7 +221,7 @@ def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
     try:
         block, *_ = _receive(packed)
         tell(None)
-        with offering(block.own):
+        with registry.offering(block.own):
             build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
     except ConfigurationError as error:
         tell(str(error))
@@ -266,15 +257,15 @@ def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool,
             "the file without the lines below, or compare with workers=1 and without limits"
         ) from error
     block, request = unpacked[0], unpacked[0].jobs[0].cell.request
-    with offering(block.own), contextlib.suppress(BaseException):
-        find_plant(request.plant)
-        find_controller(request.controller)
+    with registry.offering(block.own), contextlib.suppress(BaseException):
+        registry.find_plant(request.plant)
+        registry.find_controller(request.controller)
     return unpacked
 
 
 def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool) -> None:
     """Carry a block out and tell the result of each run."""
-    with offering(block.own):
+    with registry.offering(block.own):
         together: list[RunResult] = []
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
@@ -374,7 +365,7 @@ def open_workers(
     *,
     plants: Collection[str] = (),
     controllers: Collection[str] = (),
-    own: Sequence[Offer] = (),
+    own: Sequence[registry.Offer] = (),
     trusted: Collection[str] = (),
     steps: bool = False,
 ) -> Iterator[Workers]:
@@ -414,13 +405,13 @@ def open_workers(
                 f"the same call{again} carries out the others; on this machine a run that kills its process is a row"
             ) from error
         return
-    foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
-    foreign = foreign or any(map(is_foreign_controller, controllers))
-    limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
+    foreign = any(registry.is_foreign_plant(name, trusted=name in trusted) for name in plants)
+    foreign = foreign or any(map(registry.is_foreign_controller, controllers))
+    limits = bounds.limits(count, foreign=foreign and bounds.isolate and registry.can_travel(own))
     if count == 1 and limits == Limits():
         yield Workers()
         return
-    pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *own_modules(plants, controllers)))
+    pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)))
     try:
         yield Workers(pool.submit, count)
     finally:

@@ -276,17 +276,6 @@ class Sandbox:
 
 
 @contextlib.contextmanager
-def leaving_unguarded_script() -> Iterator[None]:
-    """End a guard in silence if the script that it imports wants workers, too: the process above says why not."""
-    try:
-        yield
-    except (ConfigurationError, RuntimeError):  # the latter of multiprocessing
-        if current_process().name == GUARD and getattr(current_process(), "_inheriting", False):
-            sys.exit(START_ERROR)
-        raise
-
-
-@contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """Hold Ctrl-C back in this thread and in processes that are started meanwhile."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -48,8 +48,9 @@ def sweep(
 
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
+    from servobench.harness.analysis.comparison import MISSING
     from servobench.harness.analysis.folder import describe_controllers
-    from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, outcome_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.plan import SweepPlan
@@ -62,7 +63,7 @@ def sweep(
     with watching(console, out, running.execution()) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
-    legend = sweep_legend(results.iterate_runs(out, columns))
+    legend = f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say(describe_controllers(out))
     say(f"table in {out / results.RUNS}")

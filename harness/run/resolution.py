@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from servobench.harness.config.registry import (
-    controller_names,
-    find_controller,
-    find_plant,
-    installed_plant,
-    is_foreign_controller,
-    plant_names,
-)
+from servobench.harness.config import registry
 from servobench.harness.config.settings import Settings, default_config, flatten, nest
 from servobench.harness.run.request import DEFAULT_ROBOT, ROLES, RunRequest, RunSettings, Varied, find_robot
 from servobench.harness.run.scenario import Task
@@ -63,7 +56,7 @@ class Sections(dict[str, Any]):
         if period == self["run"].period or (robot.camera is None and robot.twin is None):
             return ()
         if (plant, period) not in self._frames:
-            config = self.user.resolve(plant, _plant_default(find_plant(plant), robot, period))
+            config = self.user.resolve(plant, _plant_default(registry.find_plant(plant), robot, period))
             usual, own = flatten(self[plant]), flatten(config)
             changes = ((key, own[key]) for key in own if key.startswith("sensing.") and own[key] != usual[key])
             self._frames[plant, period] = tuple(changes)
@@ -112,11 +105,11 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     if len(robots) > 1:  # of which they share the settings of plants and tasks
         raise ConfigurationError(f"a batch has one robot, got {', '.join(robots)}; use a batch for each")
     robot, period = find_robot(robots[0]), settings.resolve("run", RunSettings()).period
-    find = installed_plant if to_run else find_plant
+    find = registry.installed_plant if to_run else registry.find_plant
     plants, controllers, tasks = (dict.fromkeys(getattr(each, role) for each in requests) for role in ROLES)
     defaults: dict[str, Any] = {"run": RunSettings()}
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
-    defaults |= {name: default_config(find_controller(name), model_known=robot.known) for name in controllers}
+    defaults |= {name: default_config(registry.find_controller(name), model_known=robot.known) for name in controllers}
     defaults |= {name: fitted(name, robot) for name in tasks}
     return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings, defaults)
 
@@ -199,8 +192,8 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
             in a section of a file that does not run.
     """
     names = ["run", *dict.fromkeys(running)]
-    pairs = [section for section in settings.sections if "+" in section and not is_foreign_controller(section)]
-    known = {*plant_names(), *controller_names(), *task_names(), *pairs, *names}
+    pairs = [section for section in settings.sections if "+" in section and not registry.is_foreign_controller(section)]
+    known = {*registry.plant_names(), *registry.controller_names(), *task_names(), *pairs, *names}
     for section in settings.sections:
         if section not in known:
             raise ConfigurationError(f"unknown section {section!r}: {suggest(section, known)}")
@@ -219,6 +212,8 @@ def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
     try:
         if section in task_names():
             return find_task(section).default
-        return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
+        if section in registry.plant_names():
+            return registry.find_plant(section).config()
+        return default_config(registry.find_controller(section))
     except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
         return None

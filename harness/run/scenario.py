@@ -13,7 +13,7 @@ import numpy as np
 
 from servobench.harness.run.references import FixedPoint, FollowedCurve, Reference, TaskKind, TaughtImage
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_vector, check_number, real_numbers
+from servobench.plant.contract.checks import FloatArray, as_array, check_number, real_numbers
 from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
@@ -88,7 +88,7 @@ class TaskSetting:
 
     def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
         """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
-        return None if self.model is None else as_vector("start", joint_position, self.n)
+        return None if self.model is None else as_array("start", joint_position, (self.n,))
 
     def move(self, start: Vector | FloatArray, target: Reference, duration: float) -> Scenario:
         """Return a move to a fixed target, of which the last quarter is judged."""

@@ -21,7 +21,7 @@ from servobench.harness.run.request import DEFAULT_ROBOT
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_vector, check_number
+from servobench.plant.contract.checks import FloatArray, as_array, check_number
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
@@ -59,7 +59,7 @@ class PointTask(Task):
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         start, target = (
-            as_vector(f"its setting {name}", getattr(self, name), setting.n) for name in ("start", "target")
+            as_array(f"its setting {name}", getattr(self, name), (setting.n,)) for name in ("start", "target")
         )
         robot, true = setting.taught_on()
         if self.into_view and isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
@@ -91,7 +91,7 @@ class TargetTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        target = as_vector("its setting target", self.target, setting.m)
+        target = as_array("its setting target", self.target, (setting.m,))
         return setting.move(self.start, setting.followed(FixedPoint(target)), self.duration)
 
 
@@ -117,7 +117,7 @@ class RandomTask(Task):
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
         n, clear = robot.n, robot.workspace.clear
-        lower, upper = (as_vector(f"its setting {name}", getattr(self, name), n) for name in ("lower", "upper"))
+        lower, upper = (as_array(f"its setting {name}", getattr(self, name), (n,)) for name in ("lower", "upper"))
         if not (lower < upper).all():
             raise ValueError("lower must be below upper for every joint")
         generator = named_generator(setting.seed, "start_and_target")
@@ -169,7 +169,7 @@ class CurveTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        centre, scale = as_vector("its setting centre", self.centre, setting.m), 1.0
+        centre, scale = as_array("its setting centre", self.centre, (setting.m,)), 1.0
         if setting.robot is not None:
             scale = setting.robot.workspace.scale
         radius = scale * RADII[self.curve] if self.radius is None else self.radius
@@ -205,7 +205,7 @@ class LineTask(Task):
 
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
-        begin, end = (as_vector(f"its setting {name}", getattr(self, name), setting.m) for name in ("begin", "end"))
+        begin, end = (as_array(f"its setting {name}", getattr(self, name), (setting.m,)) for name in ("begin", "end"))
         reference = setting.followed(line(begin, end, self.moving))
         return Scenario(setting.start(self.start), reference, self.duration, 0.5 * self.duration)
 

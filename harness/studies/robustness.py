@@ -17,14 +17,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import (
-    Estimate,
-    column_of,
-    median_with_interval,
-    settled_share,
-    settling_band,
-    settling_times,
-)
+from servobench.harness.analysis import comparison
 from servobench.harness.analysis.loops.loop_analysis import latency_border
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
@@ -51,7 +44,7 @@ NOTE: Final = 115  # letters of a line below it
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"
 NOISE: Final = "noise"
-Measure: TypeAlias = Callable[[pd.DataFrame], Estimate]  # of the runs at a place
+Measure: TypeAlias = Callable[[pd.DataFrame], comparison.Estimate]  # of the runs at a place
 
 
 @dataclass(frozen=True)
@@ -170,7 +163,7 @@ def map_runs(folder: Path) -> pd.DataFrame:
         ConfigurationError: not the folder of a map.
     """
     runs, configuration = results.load_runs(folder), results.read_manifest(folder)["configuration"]
-    durations = column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
+    durations = comparison.column_of(runs, DURATION).fillna(configuration[TASK]["duration"])
     moved = (runs["axis"] == MOVE) & (runs["magnitude"] > 0.0)
     return runs.assign(moved_at_s=(configuration["run"]["camera_moves_at"] * durations).where(moved))
 
@@ -186,19 +179,20 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float]) -> l
     Returns:
         The files.
     """
-    arrived = f"Runs that came within {settling_band(runs)} and stayed"
+    arrived = f"Runs that came within {comparison.settling_band(runs)} and stayed"
     took = "Median settling time, from the move where the camera moves"
-    share = _draw(runs, limits, settled_share, arrived, "settled runs [%]", 104.0)
+    share = _draw(runs, limits, comparison.settled_share, arrived, "settled runs [%]", 104.0)
     time = _draw(runs, limits, settling_median, took, "settling time [s]", 10.0)
     return style.save_figure(share, folder / "robustness") + style.save_figure(time, folder / "robustness_settling")
 
 
-def settling_median(runs: pd.DataFrame) -> Estimate:
+def settling_median(runs: pd.DataFrame) -> comparison.Estimate:
     """Return the median settling time of `runs`, s, with its bootstrap interval; infinite if half never settle.
 
     Where the camera was moved, `moved_at_s`, the time counts from there.
     """
-    return median_with_interval((settling_times(runs) - runs["moved_at_s"].fillna(0.0)).clip(lower=0.0))
+    times = comparison.settling_times(runs) - runs["moved_at_s"].fillna(0.0)
+    return comparison.median_with_interval(times.clip(lower=0.0))
 
 
 def _draw(

@@ -49,11 +49,6 @@ def as_array(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatAr
     return array
 
 
-def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
-    """Return a read-only float64 copy of `value`, (size,); errors as in `as_array`."""
-    return as_array(name, value, (size,))
-
-
 def check_number(name: str, value: float, *, above: float) -> None:
     """Check that a number is finite and greater than `above`.
 

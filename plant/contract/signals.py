@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array, as_vector, check_number, is_finite, real_numbers
+from servobench.plant.contract.checks import FloatArray, as_array, check_number, is_finite, real_numbers
 
 BoolArray = npt.NDArray[np.bool_]
 JOINT_UNIT = "rad"
@@ -86,7 +86,7 @@ class PlantSpec:
         if {type(self.feature), type(self.command)} != {Channel}:
             raise ValueError(f"feature and command must be Channels, got {self.feature!r} and {self.command!r}")
         for name in ("joint_lower", "joint_upper"):
-            object.__setattr__(self, name, as_vector(name, getattr(self, name), self.n))
+            object.__setattr__(self, name, as_array(name, getattr(self, name), (self.n,)))
         if not (self.joint_lower < self.joint_upper).all():
             raise ValueError("joint_lower must be below joint_upper for every joint")
         if not (self.command.lower == -self.command.upper).all():
@@ -115,7 +115,7 @@ class PlantSpec:
             period: control period, s.
             feature_unit: unit of the features.
         """
-        limit = as_vector("joint_velocity_limit", joint_velocity_limit, np.size(joint_names))
+        limit = as_array("joint_velocity_limit", joint_velocity_limit, (np.size(joint_names),))
         if not (limit > 0.0).all():
             raise ValueError(f"joint_velocity_limit must be positive, got {limit.tolist()}")
         unbounded = np.full(np.size(feature_names), np.inf)
@@ -179,7 +179,7 @@ class Observation:
         as_array("time", self.time, ())
         for name in ("joint_position", "feature"):
             value = getattr(self, name)
-            object.__setattr__(self, name, as_vector(name, value, np.size(value)))
+            object.__setattr__(self, name, as_array(name, value, (np.size(value),)))
         given = len(self.valid) > 0
         valid = np.array(self.valid, dtype=np.bool_) if given else np.full(len(self.feature), self.feature_valid)
         if valid.shape != self.feature.shape:

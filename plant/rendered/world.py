@@ -16,7 +16,7 @@ import numpy as np
 
 from servobench.plant.bench.plant import PlantSetup, World
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
+from servobench.plant.contract.checks import FloatArray, as_array, whole_steps
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
@@ -96,7 +96,7 @@ class RenderedWorld(World):
         sensing = config.sensing
         if any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2)) or sensing.outliers > 0.0:
             self.noise_unit = model.noise_unit  # without noise, features keep their bits
-        self._start = as_vector("start", start, self.spec.n)
+        self._start = as_array("start", start, (self.spec.n,))
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_array, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array
 
 YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # indices of the factors in a cross product
 
@@ -163,7 +163,7 @@ def arm_from_dh(
     size = n + 1 if modified and np.shape(a) == (n + 1,) else n
     missing = (0, n + 1 - size) if modified else (1, 0)  # rows before and after those of the table
     columns = ("a", a), ("d", d), ("alpha", alpha)
-    a_, d_, alpha_ = (np.pad(as_vector(name, value, size), missing) for name, value in columns)
+    a_, d_, alpha_ = (np.pad(as_array(name, value, (size,)), missing) for name, value in columns)
     y, z = (-d_ * np.sin(alpha_), d_ * np.cos(alpha_)) if modified else (np.zeros(n + 1), d_)
     rpy = np.zeros((n + 1, 3))
     rpy[:, 0] = alpha_
@@ -181,7 +181,7 @@ class JointLimits:
     def __post_init__(self) -> None:
         """Check order and signs and freeze the arrays."""
         for name in ("lower", "upper", "speed"):
-            object.__setattr__(self, name, as_vector(name, getattr(self, name), len(self.lower)))
+            object.__setattr__(self, name, as_array(name, getattr(self, name), (len(self.lower),)))
         if not (self.lower < self.upper).all():
             came = f"{self.lower.tolist()} and {self.upper.tolist()}"
             raise ValueError(f"joint_lower must be below joint_upper for every joint, got {came}")

@@ -30,7 +30,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le
 
-from servobench.plant.contract.checks import FloatArray, as_array, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import (
     Check,
@@ -125,10 +125,10 @@ def read_dh_robot(path: Path, values: Mapping[str, Any]) -> Robot:
     with configuration_errors(f"robot file {path}: "):
         arm = with_ball(_arm_of(table))
         n = arm.n
-        given = (as_vector(name, getattr(table, name), n) for name in ("joint_lower", "joint_upper", "joint_speed"))
+        given = (as_array(name, getattr(table, name), (n,)) for name in ("joint_lower", "joint_upper", "joint_speed"))
         limits = JointLimits(*given)
         mass, torque = (
-            as_vector(name, each, n) if (each := getattr(table, name)) else None for name in ("mass", "torque")
+            as_array(name, each, (n,)) if (each := getattr(table, name)) else None for name in ("mass", "torque")
         )
         links = estimate_links(arm, mass, torque)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
@@ -144,7 +144,7 @@ def _arm_of(table: DhTable) -> SerialArm:
     if len(names) != n:
         raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
     arm = arm_from_dh(table.a, table.d, table.alpha, names, modified=table.convention == "modified")
-    return replace(arm, joint_offset=as_vector("theta", table.theta, n)) if table.theta else arm
+    return replace(arm, joint_offset=as_array("theta", table.theta, (n,))) if table.theta else arm
 
 
 TURNING: Final = ("revolute", "continuous")

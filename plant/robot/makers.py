@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import as_vector
+from servobench.plant.contract.checks import as_array
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
@@ -164,7 +164,7 @@ def read_calibration(path: Path | None, tool: npt.ArrayLike) -> SerialArm:
     if not np.isfinite(table).all():
         raise ValueError(f"calibration file {path} holds a number that is not finite")
     n, rows = len(table), np.vstack([table, np.zeros(6)])  # the flange is where the last joint is
-    return SerialArm(ur5.JOINT_NAMES, rows[:, :3], rows[:, 3:], np.zeros(n), np.ones(n), as_vector("tool", tool, 3))
+    return SerialArm(ur5.JOINT_NAMES, rows[:, :3], rows[:, 3:], np.zeros(n), np.ones(n), as_array("tool", tool, (3,)))
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:

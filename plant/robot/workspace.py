@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
@@ -57,8 +57,8 @@ class Workspace:
         n = len(self.home)
         shapes = {"centre": 3, "shoulder": 3, **dict.fromkeys(("home", "lower", "upper", "stretched"), n)}
         for name, size in shapes.items():
-            object.__setattr__(self, name, as_vector(name, getattr(self, name), size))
-        moves = {name: tuple(as_vector(name, end, n) for end in ends) for name, ends in self.moves.items()}
+            object.__setattr__(self, name, as_array(name, getattr(self, name), (size,)))
+        moves = {name: tuple(as_array(name, end, (n,)) for end in ends) for name, ends in self.moves.items()}
         object.__setattr__(self, "moves", moves)
 
     @property

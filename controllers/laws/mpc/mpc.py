@@ -11,7 +11,7 @@ from servobench.controllers.laws.mpc import closed_form
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver, exceeds, joint_bounds, view_rows
 from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.finish import scale_to_limit
-from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.lanes import branch, norm, where
 from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.contract.signals import BoolArray, Observation
@@ -138,7 +138,7 @@ class MpcLaw(Law[MpcState]):
         self._places = blocks.places(config.delay)
         self._to_come = closed_form.bridging_shares(config.delay, spec.period)[:, None]
         constant, horizon = config.mode == "constant", blocks.count
-        weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
+        weight = as_array("joint_weight", config.joint_weight or np.ones(spec.n), (spec.n,))
         # One constant velocity is weighted once, not in every block.
         self._Q: FloatArray = config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
         self._terminal = config.terminal_weight / blocks.relative_length
