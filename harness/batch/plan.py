@@ -374,7 +374,7 @@ def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> No
         names = Counter(request.run_id for request in requests if hash(request.run_id) in suspects)
         name, count = names.most_common(1)[0]
         if count > 1:
-            raise ConfigurationError(f"the run {name} is asked for twice: leave one out, or name a file NAME=FILE")
+            raise ConfigurationError(f"the run {name} is asked for twice: leave one out, or rename a file (NAME=FILE)")
 
 
 def _ranges(numbers: array[int]) -> list[range]:

@@ -166,7 +166,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
     (("compare", "--controllers", "constant,cnstant"), "unknown controller 'cnstant': did you mean 'constant'?"),
     (("compare", "--controllers", "constant,all"), "--controllers names constant twice"),
-    ((*COMPARE, "--sensing", "position,position:fixed"), "is asked for twice"),
+    ((*COMPARE, "--sensing", "position,position:fixed"), "is asked for twice: leave one out, or rename a file"),
     (("compare", "--tasks", ","), "--tasks is empty; valid: exp1"),
     ((*COMPARE, "--seeds", "3,1,3"), "seeds name 3 twice, got '3,1,3'"),
     ((*COMPARE, "--seeds", "many"), "seeds must be a count (5), a list (3,1,4) or a range (100:120), got 'many'"),
