@@ -125,11 +125,7 @@ RUN, COMPARE = partial(servobench.run, "constant"), partial(servobench.compare, 
         (COMPARE, {"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
         (COMPARE, {"resume": True}, "resume needs out, the folder to continue in"),
         (servobench.load, {"folder": 3}, "folder must be the path of a folder, got 3"),
-        (
-            COMPARE,
-            {"executor": Executor(), "run_memory": 1e9},
-            "limits of time and memory are for processes of this machine",
-        ),
+        (COMPARE, {"executor": Executor(), "run_memory": 1e9}, "limits of time and memory are for processes of"),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused_in_a_line(call, given, words):

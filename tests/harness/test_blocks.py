@@ -10,7 +10,6 @@ import zlib
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
-from queue import SimpleQueue
 
 import numpy as np
 import pandas as pd
@@ -272,22 +271,19 @@ def job(index: int, kind: object) -> Job:
 
 @pytest.mark.parametrize("kind", [None, "alike"])
 def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
-    waiting: SimpleQueue[tuple[Task, Future]] = SimpleQueue()
+    held: list[Block] = []
 
-    def die_or_answer():
+    def die_or_answer(block):
         time.sleep(0.02)  # as long as other tasks come
-        tasks = [waiting.get() for _ in range(waiting.qsize())]
-        held = [blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0] for task, _ in tasks]
-        dies = any(each.index in {3, 13} for block in held for each in block.jobs)
-        for block, (_, future) in zip(held, tasks, strict=True):
-            rows = [blocks.pack_result(RunResult.failed(identity(each.run), Ending())) for each in block.jobs]
-            future.set_exception(ProcessDied()) if dies else future.set_result(Answer(rows))
+        died = any(each.index in {3, 13} for other in held for each in other.jobs)
+        held.remove(block)
+        if died:
+            raise ProcessDied
+        return Answer([blocks.pack_result(RunResult.failed(identity(each.run), Ending())) for each in block.jobs])
 
     def submit(task):
-        future = Future()
-        waiting.put((task, future))
-        thread.submit(die_or_answer)
-        return future
+        held.append(blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0])
+        return thread.submit(die_or_answer, held[-1])
 
     with ThreadPoolExecutor(1) as thread:
         made = cut([job(index, kind) for index in range(24)], size=12)

@@ -70,14 +70,8 @@ def test_the_paragraph_on_methods_says_that_robots_are_those_of_a_twin(tmp_path)
     twin, out = tmp_path / "twin.toml", tmp_path / "out"
     pose = "pose = {frame = 'base', position = [0.4, 0.1, 2.2], rotation = [0, 0, 0, 1]}"
     twin.write_text(f"robot = 'ur5'\n[camera]\n{pose}\n", encoding="utf-8")
-    compare(
-        ["constant"],
-        tasks=["exp2"],
-        robot=str(twin),
-        mismatches=["none"],
-        settings={"exp2": {"duration": 0.5}},
-        out=out,
-    )
+    short = {"exp2": {"duration": 0.5}}
+    compare(["constant"], tasks=["exp2"], robot=str(twin), mismatches=["none"], settings=short, out=out)
     runs = titled_runs(out)
     text = methods_paragraph(out, runs)
     assert "(UR5 twin); sensing: position; mismatch between true and nominal robot: drawn from the twin. " in text

@@ -254,18 +254,15 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
 
 
 def test_a_file_and_its_name_are_on_the_disk_before_the_next_is_written(tmp_path, monkeypatch):
-    kept: list[str] = []
-    sync = os.fsync
+    kept: list[tuple[int, list[str]]] = []
 
     def note(descriptor):
-        kept.append(f"{os.fstat(descriptor).st_ino} {[each.name for each in tmp_path.iterdir()]}")
-        sync(descriptor)
+        kept.append((os.fstat(descriptor).st_ino, [each.name for each in tmp_path.iterdir()]))
 
     monkeypatch.setattr("os.fsync", note)
     write_atomically(tmp_path / "table", lambda file: file.write_text("new"))
-    partial = partial_path(tmp_path / "table").name
-    inodes = (tmp_path / "table").stat().st_ino, tmp_path.stat().st_ino
-    assert kept == [f"{inodes[0]} {[partial]}", f"{inodes[1]} {['table']}"]
+    name = partial_path(tmp_path / "table").name
+    assert kept == [((tmp_path / "table").stat().st_ino, [name]), (tmp_path.stat().st_ino, ["table"])]
 
 
 def test_a_file_that_cannot_be_read_while_another_is_made_is_not_said_to_be_written(tmp_path):
