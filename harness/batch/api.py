@@ -29,7 +29,7 @@ from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import plain, remark
+from servobench.plant.contract.settings import native, remark
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
@@ -178,14 +178,14 @@ def _seeds(given: object) -> Sequence[int]:
     if isinstance(given, SupportsIndex) and not getattr(given, "ndim", 0):  # an array has an index, too
         return check_seeds(range(operator.index(given)), f"got {given!r}")
     if isinstance(given, str | bytes) or not isinstance(given, Iterable):
-        raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {plain(given)!r}")
+        raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {native(given)!r}")
     return check_seeds(tuple(map(read_seed, islice(given, MAX_SEEDS + 1))), "see the list that was given")
 
 
 def _require(fits: bool, name: str, wanted: str, came: object) -> None:
     """Raise a `ConfigurationError` that names an argument unless it is as wanted."""
     if not fits:
-        raise ConfigurationError(f"{name} must be {wanted}, got {plain(came)!r:.80}")
+        raise ConfigurationError(f"{name} must be {wanted}, got {native(came)!r:.80}")
 
 
 def _check_lists(**given: object) -> None:

@@ -248,9 +248,8 @@ def load_runs(folder: Path) -> pd.DataFrame:
     manifest, names = check_folder(folder), _intact(folder, RUNS)
     runs = tables.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", tables.common_schema(folder, names))
-    for name, kind in runs.dtypes.items():
-        if name in tables.NUMBERS and kind.kind == "O":
-            runs[name] = runs[name].astype(float)
+    empty = {name: float for name, kind in runs.dtypes.items() if name in tables.NUMBERS and kind.kind == "O"}
+    runs = runs.astype(empty) if empty else runs
     period = (manifest.get("changed") or {}).get("run.period")
     if isinstance(period, float):  # of all runs whose period no sweep varies
         runs["period_s"] = runs["period_s"].fillna(period) if "period_s" in runs else period

@@ -297,8 +297,8 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     numbers = [name for name in MOST if name in runs]
     for name, least, most in zip(numbers, runs[numbers].min(), runs[numbers].max(), strict=True):
         if least < 0.0 or most > MOST[name]:
-            wrong = least if least < 0.0 else most
-            raise ConfigurationError(f"{path} is no table of runs: the column {name} has the number {wrong:g}")
+            wrong = f"the column {name} has the number {least if least < 0.0 else most:g}"
+            raise ConfigurationError(f"{path} is no table of runs: {wrong}")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(

@@ -121,8 +121,7 @@ class Log(NamedTuple):
         repeated = ~changed | (counts[kinds[1:]] > MAX_REPEATED * len(rows))  # as 0 stands for no frame
         same = repeated & jumps[np.cumsum(changed)]
         moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
-        share = float(np.mean(same[moving])) if moving.any() else 0.0
-        if share <= MAX_REPEATED:
+        if not moving.any() or (share := float(np.mean(same[moving]))) <= MAX_REPEATED:
             return ""
         found = f"{share:.0%} of the frames repeat another one although the arm moves, first in row "
         return f"{found}{rows[1:][same & moving][0]}: give rows without a new frame feature_valid = 0"

@@ -19,7 +19,7 @@ from servobench.harness.config.source import PLACE, SourceFile, describe_at
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, plain, settings
+from servobench.plant.contract.settings import NonNegative, Number, Positive, ShareBelowOne, Usual, native, settings
 from servobench.plant.contract.units import in_own_unit, split_quantity
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.mismatch import Mismatch
@@ -224,7 +224,7 @@ def read_seed(seed: Any) -> int:  # noqa: ANN401 - as a user gave it
     """
     whole = hasattr(seed, "__index__") and not isinstance(seed, bool) and not getattr(seed, "ndim", 0)
     if not whole or operator.index(seed) < 0:
-        raise ConfigurationError(f"seed must be a non-negative integer, got {plain(seed)!r}")
+        raise ConfigurationError(f"seed must be a non-negative integer, got {native(seed)!r}")
     return operator.index(seed)
 
 

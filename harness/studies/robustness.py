@@ -207,7 +207,8 @@ def _draw(
             cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))
             numbers = [place.number for place in line.places]
             curves[axis] = {name: [measure(cells[name, each]) for each in numbers] for name in controllers}
-    flat = [axis for axis in curves if _is_flat(curves[axis])]
+    alike = [axis for axis, each in curves.items() if len(same_curves(each)) == 1]  # all methods, and at all places:
+    flat = [axis for axis in alike if len({e.value for each in curves[axis].values() for e in each}) == 1]
     lines = [KNOWN_LINES[axis] for axis in curves if axis not in flat or len(flat) == len(curves)]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with style.figure_style(style.TEXT):
@@ -230,11 +231,6 @@ def _draw(
         figure.suptitle(f"{title}\n{words}", fontsize=style.TEXT + 0.5)
         style.add_legend(figure, panels)
     return figure
-
-
-def _is_flat(curves: Curves) -> bool:
-    """Return whether all methods have the same value at all places."""
-    return len(same_curves(curves)) == 1 and len({e.value for estimates in curves.values() for e in estimates}) == 1
 
 
 def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:

@@ -359,7 +359,7 @@ def likely_meant(number: float, unit: str, fits: Callable[[float], bool], *, bar
     return f"; if {' or '.join(meant)} is meant, write {wanted}" if meant else ""
 
 
-def plain(value: Any) -> Any:  # noqa: ANN401 - anything that a user gave
+def native(value: Any) -> Any:  # noqa: ANN401 - anything that a user gave
     """Return a number or text of numpy as one of Python, whose representation in a message is the number or text."""
     return value.item() if isinstance(value, np.generic) else value
 
@@ -381,7 +381,7 @@ def describe(
         if isinstance(written, tuple) and isinstance(place, int) and place < len(written):
             written = written[place]
     name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])
-    kind, context, came = first["type"], first.get("ctx", {}), plain(first["input"])
+    kind, context, came = first["type"], first.get("ctx", {}), native(first["input"])
     if kind == "value_error":
         return " ".join(str(context["error"]).split())
     if kind in _BOUNDS:

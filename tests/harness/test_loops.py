@@ -8,7 +8,7 @@ from kit.plants import configure, setup
 from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.laws.mfac import mfac_step
 from servobench.controllers.servo import ServoController
-from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linear_controller, warm_up
+from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linearise, warm_up
 from servobench.harness.analysis.loops.loop_analysis import (
     SmallMotions,
     analyse_loop,
@@ -85,7 +85,7 @@ def test_the_response_of_the_arm_is_that_of_its_matrices(latency):
 def test_a_pid_controller_is_linearised_as_its_closed_form_says():
     warm = warm_up(resolved("pid+constant", law={"integral_gain": 0.7, "derivative_gain": 0.1}))
     z = np.exp(1j * frequencies(PERIOD, 9) * PERIOD)
-    response = linear_controller(warm, "true").response(z)
+    response = linearise(*at_rest(warm, "true")).response(z)
     tau = 0.1
     integral = PERIOD * z / (z - 1.0)
     derivative = (z - 1.0) / ((tau + PERIOD) * z - tau)
@@ -98,7 +98,7 @@ def test_a_pid_controller_is_linearised_as_its_closed_form_says():
 
 def test_an_mfac_controller_is_linearised_as_its_closed_form_says():
     warm = warm_up(resolved("mfac+constant"))
-    controller, J = linear_controller(warm, "true"), warm.arm.jacobian
+    controller, J = linearise(*at_rest(warm, "true")), warm.arm.jacobian
     gain = np.stack([mfac_step(J, each, -np.expm1(-3.25 * PERIOD), 0.02) for each in np.eye(3)], axis=-1) / PERIOD
     assert len(controller.A) == 0
     np.testing.assert_allclose(controller.D, np.hstack([-gain, np.zeros((6, 6)), gain]), atol=1e-7)
@@ -139,7 +139,7 @@ def test_margins_of_a_single_channel_are_those_of_the_library():
 @pytest.mark.parametrize("latency", [0.0, 0.03, 0.1])
 def test_the_loop_is_at_the_border_of_stability_at_its_gain_margin(latency):
     warm = warm_up(resolved("rbf_pid:published"))
-    controller, arm = linear_controller(warm, "true"), replace(warm.arm, latency=latency)
+    controller, arm = linearise(*at_rest(warm, "true")), replace(warm.arm, latency=latency)
     limit = linear_response(controller, arm).gain_limit()
     for factor, stable in ((0.995 * limit, True), (1.005 * limit, False)):
         scaled = controller._replace(C=factor * controller.C, D=factor * controller.D)
@@ -163,7 +163,7 @@ def test_a_frozen_controller_is_identified_as_it_is_linearised():
     controller = ServoController(servo)
     controller.state = state
     frequency, identified = controller_response(excite(SmallMotions(controller, warm.arm, rest), 9, length=128), PERIOD)
-    linear = linear_controller(warm, "true").response(np.exp(1j * frequency * PERIOD))[:, :, :9]
+    linear = linearise(*at_rest(warm, "true")).response(np.exp(1j * frequency * PERIOD))[:, :, :9]
     np.testing.assert_allclose(identified, linear, atol=2e-3 * np.abs(linear).max())
     margins, wanted = (LoopResponse(frequency, each, warm.arm).margins() for each in (identified, linear))
     assert margins.delay_margin_s == pytest.approx(wanted.delay_margin_s, rel=0.01)
@@ -192,7 +192,7 @@ def test_the_delay_margin_shrinks_with_the_gain_and_is_zero_for_an_unstable_loop
 def test_a_law_that_was_trained_on_the_nominal_model_has_a_delay_margin():
     small = {"jacobian": {"centres": 8, "samples": 60}, "controller": {"hidden": 4, "samples": 60}}
     warm = warm_up(resolved("rbfnn_mfac", training=small))
-    linear = linear_controller(warm, "true")
+    linear = linearise(*at_rest(warm, "true"))
     assert np.isfinite(linear.D).all()
     assert np.abs(linear.D).max() > 0.0
 
@@ -200,7 +200,7 @@ def test_a_law_that_was_trained_on_the_nominal_model_has_a_delay_margin():
 def test_a_controller_is_warm_after_its_probing_however_long_that_takes():
     warm = warm_up(resolved("ukf_mfac", initial={"source": "probe", "average_time": 1.0}))
     assert warm.controller.state.ready
-    linear_controller(warm, "true")
+    linearise(*at_rest(warm, "true"))
 
 
 def test_only_a_composed_controller_has_a_fast_delay_margin():

@@ -311,11 +311,6 @@ def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:
     return servo, state, replace(rest, time=rest.time + SETTLING_PERIODS * period)
 
 
-def linear_controller(warm: Warm, source: Source) -> StateSpace:
-    """Return a composed controller around its rest as a linear system; see `at_rest` and `linearise`."""
-    return linearise(*at_rest(warm, source))
-
-
 class SmallLoop:
     """A composed controller, frozen at its rest, on the kinematic plant without noise."""
 

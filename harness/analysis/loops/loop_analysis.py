@@ -21,7 +21,7 @@ import pandas as pd
 from servobench.controllers.controller import Controller
 from servobench.controllers.servo import ServoController
 from servobench.harness.analysis.comparison import number
-from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, linear_controller, warm_up
+from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Rest, Source, at_rest, linearise, warm_up
 from servobench.harness.analysis.loops.systems import (
     POINTS,
     ArmModel,
@@ -273,7 +273,7 @@ def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bo
         arm, (m, n) = warm.arm, warm.arm.jacobian.shape
         steps = round(STEP_DURATION / arm.period)
         if isinstance(warm.controller, ServoController) and not identify:
-            controller = linear_controller(warm, source)
+            controller = linearise(*at_rest(warm, source))
             closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
             stable, step = is_stable(closed.A), closed.step(m, arm.period, steps)
             return LoopAnalysis(name, "linearised", stable, response.margins(), response, step)
@@ -314,7 +314,7 @@ def delay_margin(
     with one_thread():
         try:
             warm = warm_up(resolved)
-            controller = linear_controller(warm, "true")
+            controller = linearise(*at_rest(warm, "true"))
         except RunFault:
             return 0.0
         if not is_stable(closed_loop(warm.arm.matrices(), controller).A):
