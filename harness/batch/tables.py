@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
@@ -291,13 +290,13 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     Raises:
         ConfigurationError: names the table, the column and the row.
     """
-    empty = runs[list(NEEDED["runs"])].isna().to_numpy()
-    for row, name in np.argwhere(empty)[:1]:
-        raise ConfigurationError(f"{path} is no table of runs: row {row} has no {NEEDED['runs'][name]}")
-    numbers = [name for name in MOST if name in runs]
-    for name, least, most in zip(numbers, runs[numbers].min(), runs[numbers].max(), strict=True):
-        if least < 0.0 or most > MOST[name]:
-            wrong = f"the column {name} has the number {least if least < 0.0 else most:g}"
+    for name in NEEDED["runs"]:
+        if (empty := runs[name].isna().to_numpy()).any():
+            raise ConfigurationError(f"{path} is no table of runs: row {empty.argmax()} has no {name}")
+    least, most = runs.min(numeric_only=True).to_dict(), runs.max(numeric_only=True).to_dict()
+    for name in [each for each in MOST if each in least]:
+        if least[name] < 0.0 or most[name] > MOST[name]:
+            wrong = f"the column {name} has the number {min(least[name], 0.0) or most[name]:g}"
             raise ConfigurationError(f"{path} is no table of runs: {wrong}")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
