@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.request import SHORT_NAMES
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checksums import SUMS, Sums, read_sums
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -293,6 +294,8 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     for name in NEEDED["runs"]:
         if (empty := runs[name].isna().to_numpy()).any():
             raise ConfigurationError(f"{path} is no table of runs: row {empty.argmax()} has no {name}")
+    if "settling_time_s" not in runs and (runs["status"] == COMPLETED).any():
+        raise ConfigurationError(f"{path} is no table of runs: it lacks the column settling_time_s")
     least, most = runs.min(numeric_only=True).to_dict(), runs.max(numeric_only=True).to_dict()
     for name in [each for each in MOST if each in least]:
         if least[name] < 0.0 or most[name] > MOST[name]:
