@@ -129,7 +129,8 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     if lacking:
         raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
     with configuration_errors(f"{what} has a number without end: ", OverflowError):
-        values = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+        told = table[list(names)].replace({"True": 1, "False": 0})  # texts, where one cell of a column is none of both
+        values = told.apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0].tolist()
         cell = str(table[names[column]].iloc[row])

@@ -159,6 +159,8 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of
          "has 80 rows, 50 s apart; it needs two or more, and time_s in s, not in ms"),
         (lambda table: table.assign(time_s=[f"{time} s" for time in table["time_s"]]),
          "row 0: time_s must .* got '0.0 s'"),
+        (lambda table: table.assign(feature_valid=["True"] * (len(table) - 1) + ["Tr"]),  # its last line is cut
+         "row 79: feature_valid must be a finite number, got 'Tr'"),
     ],
 )  # fmt: skip
 def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message):
