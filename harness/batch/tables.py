@@ -299,8 +299,7 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     least, most = runs.min(numeric_only=True).to_dict(), runs.max(numeric_only=True).to_dict()
     for name in [each for each in MOST if each in least]:
         if least[name] < 0.0 or most[name] > MOST[name]:
-            wrong = f"the column {name} has the number {min(least[name], 0.0) or most[name]:g}"
-            raise ConfigurationError(f"{path} is no table of runs: {wrong}")
+            raise ConfigurationError(f"{path} is no table of runs: {name} is {min(least[name], 0.0) or most[name]:g}")
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(

@@ -250,6 +250,7 @@ def _remedies(log: Log, model: RobotModel, others: Others) -> Iterator[_Remedy]:
     alphabetical = np.argsort(np.argsort(names))
     yield changed("joints are in alphabetical order, as in ROS", joints=q[:, alphabetical])
     yield changed("joints are in reverse order", joints=q[:, ::-1])
+    yield changed("the directions of all joints are reversed", joints=-q)
     for i, name in enumerate(names):
         sign = np.where(np.arange(n) == i, -1.0, 1.0)
         yield changed(f"the direction of joint {name} is reversed", joints=q * sign)

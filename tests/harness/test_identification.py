@@ -285,6 +285,7 @@ MISTAKES = {
     "repeated": (repeated, r"25% of the frames repeat another one although the arm moves, first in row \d+"),
     "zeros": (zeros, r"5% of the frames repeat another one .* first in row 20: give rows without .* feature_valid = 0"),
     "lost": (lost, r"joint \w+ jumps by .* rad in row 90, faster than it can move: interpolate"),
+    "negated": (lambda log: log._replace(joints=-log.joints), "the directions of all joints are reversed"),
     "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
     "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "; if the log is in degrees, write it in rad"),
     "centimetres": (lambda log: log._replace(features=1e2 * log.features), "likely in cm; write them in m"),
