@@ -56,9 +56,9 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
         file = Path(str(error.filename or path))
         if path is not None and done == "written" and path not in (file, *file.parents) and file not in path.parents:
             raise ConfigurationError(f"{file}, which {path} needs, cannot be read: {reason(error)}") from error
-        if done == "written" and error.errno is None:  # none of the system, as of a library that draws
-            raise
-        named = f"{kind} {path}" if kind else error.filename or path or "a temporary file"
+        if done == "written" and (error.errno is None or not (path or error.filename)):
+            raise  # of a library that draws, or of no file in particular
+        named = f"{kind} {path}" if kind else error.filename or path
         raise ConfigurationError(f"{named} cannot be {done}: {reason(error)}") from error
 
 

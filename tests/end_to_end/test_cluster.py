@@ -58,7 +58,7 @@ def test_a_cluster_runs_what_is_in_files_and_a_worker_that_is_killed_in_mid_swee
     cluster, tmp_path, monkeypatch
 ):
     scheduler, workers = cluster
-    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
+    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/sent.py")
     named = ("--plants", f"{cell}:Cell,kinematic", "--controllers", f"{mine},broyden")
     asked = ("sweep", *named, *SEEDS, "--set", "Mine.gain=3", "--set", "Cell.speed=0.5", "--out")
     remote = start(*asked, str(tmp_path / "remote"), "--scheduler", scheduler)

@@ -10,10 +10,10 @@ from kit.lanes import assert_rows_of_single_runs
 from kit.plants import NEEDS_MUJOCO
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
+from servobench.harness.config import registry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import Settings, default_config
 from servobench.harness.pictures.replay import logged_run
-from servobench.harness.run import resolution as resolved
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build, train_networks
 from servobench.harness.run.export import arm_product, loop_products
@@ -84,7 +84,7 @@ def test_the_manifest_says_which_arm_it_was(tmp_path):
 
 
 def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
-    monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
+    monkeypatch.setattr(registry, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
     with pytest.raises(ConfigurationError, match="brings a robot of its own, so the robot panda does not apply"):
         resolve(PANDA, Settings())
 
