@@ -162,17 +162,12 @@ def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> l
 def _faster(tables: Tables, plant: str) -> Answer:
     compared = pairings(tables[MAIN], "settling_time_s", "settling time, proposed − rival, mean, s", "better")
     middles = medians(tables[MAIN], "settling time, median, s")
+    times = {m: f"{m.estimate.value:.2f} s" if isfinite(m.estimate.value) else "never" for m in middles}
     words = "; ".join(
-        f"{task} " + ", ".join(f"{m.label} {_seconds(m.estimate.value)}" for m in middles if m.place == task)
-        for task in MOVES
+        f"{task} " + ", ".join(f"{m.label} {times[m]}" for m in middles if m.place == task) for task in MOVES
     )
     evidence = f"faster in {held(compared)} of {len(compared)} pairings; medians {words}"
     return answer("1", "converges faster than the other three", plant, compared, evidence, middles)
-
-
-def _seconds(median: float) -> str:
-    """Return a median settling time in words; an infinite one is that of runs of which most never settle."""
-    return f"{median:.2f} s" if isfinite(median) else "never"
 
 
 def _overshoot_and_path(tables: Tables, plant: str) -> Answer:
