@@ -112,14 +112,16 @@ class Log(NamedTuple):
 
     def frame_mistake(self) -> str:
         """Name frames given as new that equal the one before, or are all the same, although the arm moves."""
-        rows = np.flatnonzero(self.valid)
+        rows = frames_of(self)
         _, kinds, counts = np.unique(self.features[rows], axis=0, return_inverse=True, return_counts=True)
-        steps = np.abs(np.diff(self.features[rows], axis=0))
-        changed, least = steps.any(axis=1), np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
-        large = (steps > LARGE * least).any(axis=1)[changed]
+        steps = np.diff(self.features[rows], axis=0)
+        moves = steps[changed := steps.any(axis=1)]
+        large = (np.abs(moves) > LARGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)).any(axis=1)
         jumps = np.append(False, large) | np.append(large, True)  # into or out of equal frames, no single whole pixel
-        repeated = ~changed | (counts[kinds[1:]] > MAX_REPEATED * len(rows))  # as 0 stands for no frame
-        same = repeated & jumps[np.cumsum(changed)]
+        back = np.linalg.norm(moves[:-1] + moves[1:], axis=1) < 0.5 * np.linalg.norm(moves[1:], axis=1)
+        often = (counts > max(2, MAX_REPEATED * len(rows)))[kinds[1:]]  # as 0 stands for no frame, but not in laps
+        runs = np.cumsum(changed)
+        same = (~changed | (often & np.pad(back, 1)[runs])) & jumps[runs]
         moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
         if not moving.any() or (share := float(np.mean(same[moving]))) <= MAX_REPEATED:
             return ""
