@@ -18,6 +18,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run import export as controller_fmu
 from servobench.harness.run.request import RunRequest
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.lanes import map_arrays
 
 PERIOD, N, M = 0.05, 6, 3
 METHODS = [
@@ -170,16 +171,17 @@ def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
             controller.fmu.setReal(controller.outputs[:1], [0.0])
 
 
-@pytest.mark.parametrize("begin", [0.0, 5.0])
-def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, begin):
+@pytest.mark.parametrize(("begin", "fault", "growth"), [(0.0, 1e-6, 0.0), (5.0, 1e-6, 0.0), (0.0, 0.0, 1e-10)])
+def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch, begin, fault, growth):
     recorded = controller_fmu._step
 
     def faulty(servo, state, inputs):
         state, output = recorded(servo, state, inputs)
-        return state, output + 1e-6 * (inputs["time"] >= begin)
+        grown = map_arrays(lambda each: each if each.dtype == np.bool_ else each * (1.0 + growth), state)
+        return grown if growth else state, output + fault * (inputs["time"] >= begin)
 
     monkeypatch.setattr(controller_fmu, "_step", faulty)
-    with pytest.raises(ConfigurationError, match="over 5 periods it would differ from the original by 1e-06, allowed"):
+    with pytest.raises(ConfigurationError, match="over 5 periods it would differ from the original by .e-.., allowed"):
         controller_fmu.controller_model(RunRequest("kinematic", "cfdl_mfac:published", "target", "none", 0), Settings())
 
 
