@@ -99,14 +99,15 @@ class Log(NamedTuple):
         return jump if is_turn else ""
 
     def first_jump(self) -> tuple[str, bool]:
-        """Return where a joint moves far beyond its speed, with the remedy, empty for nowhere; and if by a turn."""
+        """Return where a joint moves far beyond its speed, by a turn if one does, with the remedy; and if by a turn."""
         jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
         beyond = np.argwhere(jumps > FASTEST * self.spec.joint_velocity_limit * self.spec.period + MAX_JUMP).tolist()
         if not beyond:
             return "", False
-        row, joint = beyond[0]
+        turns = np.abs(jumps - 2.0 * np.pi) <= MAX_OFF_TURN
+        row, joint = max(beyond, key=lambda at: turns[*at])  # the first of them
         where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
-        if abs(jumps[row, joint] - 2.0 * np.pi) <= MAX_OFF_TURN:
+        if turns[row, joint]:
             return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)", True
         return f"{where}, faster than it can move: interpolate positions that are missing or held, or cut there", False
 

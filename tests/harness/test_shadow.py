@@ -198,6 +198,7 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
     "degrees": (JOINTS, np.degrees, "rad, beyond its range of .*; if the log is in degrees, write it in rad", True),
     "millimetres": (FEATURES, lambda y: 1000.0 * y, "if the log is in mm, write it in m", True),
     "wrapped": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi), "unwrap it", True),
+    "both": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi) + 0.7 * (np.arange(len(q)) == 0)[:, None], "unwrap", True),
     "zeros": (FEATURES[:3], lambda y: np.where(np.arange(len(y))[:, None] % 9, y, 0.0), "feature_valid = 0", False),
     "held": (JOINTS, lambda q: np.where(np.arange(len(q))[:, None] % 60, q, q[0]), "faster than it can move", False),
     "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
