@@ -100,8 +100,8 @@ class Log(NamedTuple):
 
     def first_jump(self) -> tuple[str, bool]:
         """Return where a joint moves far beyond its speed, by a turn if one does, with the remedy; and if by a turn."""
-        jumps = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1]))
-        beyond = np.argwhere(jumps > FASTEST * self.spec.joint_velocity_limit * self.spec.period + MAX_JUMP).tolist()
+        jumps, limits = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1])), self.spec.joint_velocity_limit
+        beyond = np.argwhere(jumps > FASTEST * limits * self.spec.period + MAX_JUMP).tolist()
         if not beyond:
             return "", False
         turns = np.abs(jumps - 2.0 * np.pi) <= MAX_OFF_TURN
@@ -109,7 +109,7 @@ class Log(NamedTuple):
         where = f"joint {self.spec.joint_names[joint]} jumps by {jumps[row, joint]:.4g} rad in row {row}"
         if turns[row, joint]:
             return f"{where}, as it is wrapped at ±π: unwrap it (numpy.unwrap)", True
-        return f"{where}, faster than it can move: interpolate positions that are missing or held, or cut there", False
+        return f"{where}, above {limits[joint]:.3g} rad/s: interpolate lost or held positions, or cut there", False
 
     def frame_mistake(self) -> str:
         """Name frames given as new that equal the one before, or are all the same, although the arm moves."""

@@ -284,7 +284,7 @@ MISTAKES = {
     "moved": (moved, r"features jump by 0\.05 m about 1[1-3] s after the begin"),
     "repeated": (repeated, r"25% of the frames repeat another one although the arm moves, first in row \d+"),
     "zeros": (zeros, r"5% of the frames repeat another one .* first in row 20: give rows without .* feature_valid = 0"),
-    "lost": (lost, r"joint \w+ jumps by .* rad in row 90, faster than it can move: interpolate"),
+    "lost": (lost, r"joint \w+ jumps by .* rad in row 90, above [\d.]+ rad/s: interpolate"),
     "negated": (lambda log: log._replace(joints=-log.joints), "the directions of all joints are reversed"),
     "wrapped": (wrapped, r"joint wrist_2 jumps by 6\.\d+ rad in row \d+, as it is wrapped at ±π: unwrap it"),
     "degrees": (lambda log: log._replace(joints=np.degrees(log.joints)), "; if the log is in degrees, write it in rad"),

@@ -200,7 +200,7 @@ SLIPS = {  # name -> begin of the columns, what happens to them, the message; an
     "wrapped": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi), "unwrap it", True),
     "both": (JOINTS, lambda q: (q - q[40]) % (2.0 * np.pi) + 0.7 * (np.arange(len(q)) == 0)[:, None], "unwrap", True),
     "zeros": (FEATURES[:3], lambda y: np.where(np.arange(len(y))[:, None] % 9, y, 0.0), "feature_valid = 0", False),
-    "held": (JOINTS, lambda q: np.where(np.arange(len(q))[:, None] % 60, q, q[0]), "faster than it can move", False),
+    "held": (JOINTS, lambda q: np.where(np.arange(len(q))[:, None] % 60, q, q[0]), "above 1 rad/s: interpolate", False),
     "order": (JOINTS, lambda q: q[:, ::-1], "move otherwise than this robot's at these joints", False),
     "sign": (JOINTS, np.negative, "move otherwise than this robot's at these joints", False),
     "kilometres": (FEATURES, lambda y: y / 1000.0, "move otherwise than this robot's at these joints", False),
