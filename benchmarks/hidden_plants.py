@@ -70,7 +70,7 @@ def hidden(seed: int, plant: str) -> list[dict[str, Any]]:
     experiment.plant.close()
     others = {name: find_robot(name).nominal for name in ROBOTS if name != robot and find_robot(name).n == log.spec.n}
     began = time.perf_counter()
-    said, found = mistakes(log, nominal, others)
+    said, found = mistakes(log, nominal, lambda: others)
     response = command_response(log)
     about |= {"seconds": time.perf_counter() - began, "said": said}
     rows: list[tuple[Any, ...]] = []

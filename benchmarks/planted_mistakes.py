@@ -112,7 +112,7 @@ MISTAKES: Final[dict[str, tuple[Change, str]]] = {
     "mm": (features(lambda y: 1e3 * y), "in mm"),
     "axis mirrored": (features(lambda y: y * (1.0, -1.0, 1.0)), "axis of the camera is mirrored"),
     "clocks drift": (drifting, "clocks of camera and joints drift"),
-    "frames repeat": (repeated, "repeat the one before"),
+    "frames repeat": (repeated, "frames repeat another one"),
     "rows missing": (with_gap, "rows must be the control period"),
     "another arm": (lambda log: log._replace(robot=TWINS[log.robot]) if log.robot in TWINS else log, "the arm is a"),
     "camera moved": (moved, "camera or the ball was moved"),
@@ -140,7 +140,7 @@ def said(log: Logged, folder: Path) -> str:
         return str(error)
     own, model = find_robot(log.robot), find_sensing("position").nominal(find_robot(log.robot))
     others = {name: find_robot(name).nominal for name in ROBOTS if name != log.robot and find_robot(name).n == own.n}
-    return mistakes(read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * np.pi), log.table), model, others)[0]
+    return mistakes(read_log(hand_eye_spec(model, 0.05, 1.0, 2.0 * np.pi), log.table), model, lambda: others)[0]
 
 
 def planted(seed: int, folder: Path, pairs: int) -> list[dict[str, Any]]:

@@ -114,7 +114,7 @@ def identified(plant: Hidden, truth: str, seed: int) -> tuple[str, str]:
     experiment.plant.close()
     log, own = read_log(experiment.plant.spec, made.steps), find_robot(plant.robot)
     others = {name: find_robot(name).nominal for name in ROBOTS if name != plant.robot and find_robot(name).n == own.n}
-    said, found = mistakes(log, find_sensing("position").nominal(own), others)
+    said, found = mistakes(log, find_sensing("position").nominal(own), lambda: others)
     if found is None:
         return said, ""
     return said, twin_text(found, log, command_response(log), (plant.robot, "position"))
