@@ -48,7 +48,7 @@ from servobench.plant.contract.signals import BoolArray
 IntArray: TypeAlias = npt.NDArray[np.int_]
 GATE: Final = 10.0  # [1] of ‖ν‖²/s, above which the excess is taken for noise of the frame
 LEAD_CAP: Final = 100.0  # [1] largest lead in −2 ln likelihood, so that a filter can come back after a change
-CACHED: Final = 32  # runs side by side that learn in one piece: more would all wait for one that moves
+PIECE: Final = 32  # runs side by side whose filters are updated at once; all of them if a single one learns
 REST_DRIFT: Final = 4.472136e-4  # [m/√s] walk of the feature at rest, r
 MIN_MOTION: Final = 0.002  # [rad] shortest ‖Δq‖ from which W is learned
 MOVED_FRAMES: Final = 3  # successive frames that do not fit but agree with each other, of a moved camera
@@ -142,8 +142,8 @@ def learn(
 
 
 def _parts(bank: FloatArray) -> Sequence[Any]:
-    """Return indices of a few runs side by side each, whose filters fit into the cache of a processor together."""
-    return [slice(k, k + CACHED) for k in range(0, len(bank), CACHED)] if bank.ndim > 3 else [...]
+    """Return indices of `PIECE` runs side by side each."""
+    return [slice(k, k + PIECE) for k in range(0, len(bank), PIECE)] if bank.ndim > 3 else [...]
 
 
 def _corrected(bank: FloatArray, known: FloatArray, gain: FloatArray) -> FloatArray:

@@ -102,17 +102,17 @@ def write_table(table: pa.Table, path: Path, batch: str = "") -> None:
 def join(folder: Path, names: Sequence[str], batch: str, path: Path) -> None:
     """Write tables as one, holding few rows in memory; the columns that a table lacks are null."""
     schema = common_schema(folder, names).with_metadata({BATCH: batch} if batch else None)
-    none, rows = schema.empty_table(), 0
-    waiting = [none]
+    start, rows = schema.empty_table(), 0
+    waiting = [start]
     with path.open("wb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
         for name in names:
             with opened(folder, name) as part:  # threads and datasets would hold memory that grows with the parts
                 table = part.read(use_threads=False).replace_schema_metadata()
-                waiting.append(pa.concat_tables([none, table], promote_options="permissive"))
+                waiting.append(pa.concat_tables([start, table], promote_options="permissive"))
             rows += len(table)
             if rows >= ROW_GROUP or (name == names[-1] and rows):
                 writer.write_table(pa.concat_tables(waiting).replace_schema_metadata(schema.metadata))
-                waiting, rows = [none], 0
+                waiting, rows = [start], 0
 
 
 def read_tables(

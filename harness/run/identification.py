@@ -51,9 +51,9 @@ EXPOSURE: Final = ("latency", *EXTRAS[:5])  # which joints a frame shows
 ARM: Final = ("gear", "zero", "link", "tool")
 """How the names of the arm's own parameters begin."""
 MAX_OFF_TURN: Final = 1.0  # [rad] by which the jump of a wrapped joint is no turn
-FASTEST: Final = 1.5  # [1] speed of a joint over its limit at most
-MAX_JUMP: Final = 0.05  # [rad] from row to row, beyond this speed
-LARGE: Final = 2.5  # [1] of the least change of a feature, which is 1 where a detector finds whole pixels
+JUMP_SPEED: Final = 1.5  # [1] of the speed limit of a joint, and
+JUMP_STEP: Final = 0.05  # [rad] in addition, beyond which a motion from row to row is a jump
+CHANGE: Final = 2.5  # [1] of the least change of a feature, such as one pixel, beyond which a change is large
 MAX_REPEATED: Final = 0.01  # [1] share of frames that equal another one although the arm moves
 MIN_JOINT_STEP: Final = 1e-4  # [rad] between two frames of an arm that moves
 UNLIKELY: Final = 3.0  # [1] prior deviations of one of these from the nominal robot
@@ -101,7 +101,7 @@ class Log(NamedTuple):
     def first_jump(self) -> tuple[str, bool]:
         """Return where a joint moves far beyond its speed, by a turn if one does, with the remedy; and if by a turn."""
         jumps, limits = np.abs(np.diff(self.joints, axis=0, prepend=self.joints[:1])), self.spec.joint_velocity_limit
-        beyond = np.argwhere(jumps > FASTEST * limits * self.spec.period + MAX_JUMP).tolist()
+        beyond = np.argwhere(jumps > JUMP_SPEED * limits * self.spec.period + JUMP_STEP).tolist()
         if not beyond:
             return "", False
         turns = np.abs(jumps - 2.0 * np.pi) <= MAX_OFF_TURN
@@ -117,12 +117,12 @@ class Log(NamedTuple):
         _, kinds, counts = np.unique(self.features[rows], axis=0, return_inverse=True, return_counts=True)
         steps = np.diff(self.features[rows], axis=0)
         moves = steps[changed := steps.any(axis=1)]
-        large = (np.abs(moves) > LARGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)).any(axis=1)
-        jumps = np.append(False, large) | np.append(large, True)  # into or out of equal frames, no single whole pixel
+        large = (np.abs(moves) > CHANGE * np.abs(moves).min(axis=0, initial=np.inf, where=moves != 0.0)).any(axis=1)
+        jumps = np.append(False, large) | np.append(large, True)  # large changes before or after equal frames
         back = np.linalg.norm(moves[:-1] + moves[1:], axis=1) < 0.5 * np.linalg.norm(moves[1:], axis=1)
         often = (counts > max(2, MAX_REPEATED * len(rows)))[kinds[1:]]  # as 0 stands for no frame, but not in laps
-        runs = np.cumsum(changed)
-        same = (~changed | (often & np.pad(back, 1)[runs])) & jumps[runs]
+        since = np.cumsum(changed)  # changes so far, which equal frames share
+        same = (~changed | (often & np.pad(back, 1)[since])) & jumps[since]
         moving = np.abs(np.diff(self.joints[rows], axis=0)).max(axis=1) > MIN_JOINT_STEP
         if not moving.any() or (share := float(np.mean(same[moving]))) <= MAX_REPEATED:
             return ""

@@ -129,7 +129,7 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     if lacking:
         raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
     with configuration_errors(f"{what} has a number without end: ", OverflowError):
-        told = table[list(names)].replace({"True": 1, "False": 0})  # texts, where one cell of a column is none of both
+        told = table[list(names)].replace({"True": 1, "False": 0})  # texts if another cell is no truth
         values = told.apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0].tolist()
