@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -24,6 +25,8 @@ from servobench.plant.contract.files import PARTIAL, accessing, harmless
 
 LOCK = ".lock"
 PARTS: Final = "parts"
+NAME_TIMEOUT: Final = 1.0  # [s] for which a refused process waits until the holder has written its name
+NAME_POLL: Final = 0.01  # [s]
 
 
 @dataclass(frozen=True)
@@ -132,15 +135,33 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+            if _same(path, descriptor):
+                return os.dup(descriptor), before  # a lock stays as long as any duplicate is open
+        except BlockingIOError:
+            holder = _wait_for_name(path, descriptor)
+            # The holder may give the lock back while its name is awaited; then the lock is free again.
+            if _same(path, descriptor):
+                who = holder or before or "a process that did not write its name"
+                raise ConfigurationError(f"results folder {path.parent} is being written by {who}") from None
+        finally:
             os.close(descriptor)
-            if not isinstance(error, BlockingIOError):  # such as ENOLCK of a mount without a lock service
-                raise
-            holder = Holder.read(path) or before or "a process that did not write its name"
-            raise ConfigurationError(f"results folder {path.parent} is being written by {holder}") from None
-        if _same(path, descriptor):
-            return descriptor, before
-        os.close(descriptor)
+
+
+def _wait_for_name(path: Path, descriptor: int) -> Holder | None:
+    """Return the process that holds a lock, which writes its name after it took the lock.
+
+    Returns:
+        None where it gives the lock back, or does not write its name within `NAME_TIMEOUT`.
+    """
+    deadline = time.monotonic() + NAME_TIMEOUT
+    while _same(path, descriptor):
+        holder = Holder.read(path)
+        if holder is not None and not holder.gone:
+            return holder
+        if time.monotonic() > deadline:
+            return None
+        time.sleep(NAME_POLL)
+    return None
 
 
 def _same(path: Path, descriptor: int) -> bool:

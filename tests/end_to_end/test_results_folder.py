@@ -1,10 +1,14 @@
 """A results folder under attack: by a second process, a full disk, a kill at any operation, and hands."""
 
+import fcntl
+import json
 import os
 import random
 import shutil
 import signal
+import threading
 import time
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +17,7 @@ import pytest
 
 from kit.command import finish, judged, part_count, servobench, start, wait_for
 from night import file_faults
-from servobench.harness.batch import campaign, results
+from servobench.harness.batch import campaign, lock, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.processes import Bounds
@@ -78,15 +82,41 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
     assert examine(out).findings == []
 
 
+def test_a_process_that_is_refused_waits_for_the_name_of_one_that_has_just_taken_the_lock(tmp_path):
+    file = tmp_path / lock.LOCK
+    with file.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        name = json.dumps(asdict(lock.Holder.this_process()))
+        late = threading.Timer(0.2, file.write_text, (name,))
+        late.start()
+        with (
+            pytest.raises(ConfigurationError, match=f"is being written by process {os.getpid()} of"),
+            lock.locked(tmp_path),
+        ):
+            pass
+        late.join()
+
+
+def test_a_lock_that_is_given_back_while_its_name_is_awaited_is_taken(tmp_path):
+    file = tmp_path / lock.LOCK
+    with file.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        end = threading.Timer(0.2, lambda: (file.unlink(), held.close()))
+        end.start()
+        with lock.locked(tmp_path):
+            assert lock.Holder.read(file) is not None
+        end.join()
+
+
 def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed(tmp_path, monkeypatch):
     out, how = tmp_path / "out", Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False))
-    batch, lock = file_faults.campaign(False, ("constant",), 4), campaign.locked
+    batch, locked = file_faults.campaign(False, ("constant",), 4), campaign.locked
     out.mkdir()
 
     def late(folder: Path, **options: bool):
-        monkeypatch.setattr(campaign, "locked", lock)
+        monkeypatch.setattr(campaign, "locked", locked)
         carry_out(batch, out, how)
-        return lock(folder, **options)
+        return locked(folder, **options)
 
     monkeypatch.setattr(campaign, "locked", late)
     carry_out(batch, out, how)
