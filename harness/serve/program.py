@@ -19,6 +19,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
 STAMP: Final = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")  # the date that a control script has in it
+SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")  # which no line of HTTP has, whatever its method
 COMMAND: Final = "input_int_register_0"
 COMMANDS: Final = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER: Final = frozenset(CONTROLLER["commands"]["without_answer"])
@@ -35,6 +36,13 @@ def script_version(script: bytes) -> tuple[str, bool]:
     if digest in known:
         return f"ur-rtde {known[digest]}", digest == next(iter(known))
     return f"{len(script)} bytes, dated {stamp[1].decode() if stamp else 'nowhere'}, SHA-256 {digest[:12]}…", False
+
+
+def begins_script(text: bytes) -> bool:
+    """Return whether bytes are the beginning of a script, also while its first line has not come whole."""
+    if b"\n" in text:
+        return SCRIPT_START.match(text) is not None
+    return b"def ".startswith(text[:4])
 
 
 def profile(distance: float, speed: float, acceleration: float) -> tuple[float, Callable[[float], float]]:

@@ -26,7 +26,7 @@ from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest, find_robot
 from servobench.harness.run.resolution import check_settings, resolve
 from servobench.harness.serve import wire
-from servobench.harness.serve.program import COMMAND, ControlProgram, script_version
+from servobench.harness.serve.program import COMMAND, ControlProgram, begins_script, script_version
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import ConfigurationError, RunFault
 from servobench.plant.contract.files import reason
@@ -42,7 +42,8 @@ BACKLOG: Final = 0.1  # [s] behind the wall clock from which the backlog is drop
 SEND_BUFFER: Final = 1 << 17  # bytes that wait for a slow reader, from which packets are left out
 PACKETS_A_PERIOD: Final = 50  # packets of a client in a period; the others wait
 SCRIPT_SIZE: Final = 1 << 20  # bytes of a script at most
-LINE_SIZE: Final = 4096  # bytes of a line at most
+SCRIPT_END: Final = b"\nend\n"
+CONNECTIONS: Final = 32  # to a port at once
 
 
 @dataclass(eq=False)
@@ -99,6 +100,9 @@ class Server:
         self.program = ControlProgram(self._spec, drive, say, lockstep=lockstep)
         self._clients: set[Client] = set()
         self._watchers: dict[StreamWriter, bool] = {}  # of features, and whether they want pictures
+        self._open: dict[str, set[StreamWriter]] = {port: set() for port in PORTS}
+        self._silent: dict[StreamWriter, str] = {}  # ports of connections that said nothing whole yet, oldest first
+        self._crowded: set[str] = set()  # ports at which a connection had to give way
         self._fault: str | None = None
         self._sent, self._untold, self._turn = 0, 0, asyncio.Event()
         self.state: dict[str, Any] = {**wire.CONTROLLER["constant"], "actual_digital_output_bits": 0}
@@ -115,7 +119,7 @@ class Server:
             for handler, (name, port) in zip(handlers, PORTS.items(), strict=True):
                 guarded = partial(self._guard, name, handler)
                 try:
-                    server = await asyncio.start_server(guarded, address, port, limit=LINE_SIZE)
+                    server = await asyncio.start_server(guarded, address, port, limit=wire.MAX_LINE)
                 except OSError as error:
                     remedy = "serve at another address of this machine, such as --address 127.0.0.2"
                     if error.errno == errno.EADDRINUSE:
@@ -148,16 +152,40 @@ class Server:
 
     async def _guard(self, port: str, handler: Handler, reader: StreamReader, writer: StreamWriter) -> None:
         """Close a connection with a line where its bytes make no sense, and without one where its other end is gone."""
+        if not self._has_room(port):
+            writer.transport.abort()
+            return
+        self._open[port].add(writer)
+        self._silent[writer] = port
         try:
             await handler(reader, writer)
-        except (ConnectionError, asyncio.CancelledError):  # as at the end of the server
+        except (OSError, asyncio.CancelledError):  # as at the end of the server
             pass
-        except ValueError as error:
-            why = error if isinstance(error, wire.WireError) else f"a line must have at most {LINE_SIZE} bytes"
-            self._say(f"{port}: {why}; the connection is closed")
+        except wire.WireError as error:
+            if writer in self._open[port]:
+                self._say(f"{port}: {error}; the connection is closed")
         finally:
             self._watchers.pop(writer, None)
+            self._silent.pop(writer, None)
+            self._open[port].discard(writer)
+            if writer.transport.get_write_buffer_size():  # a client that never reads would keep it open
+                writer.transport.abort()
             writer.close()
+
+    def _has_room(self, port: str) -> bool:
+        """Return whether a port takes one more connection; one that has never said anything gives way to it."""
+        if len(self._open[port]) < CONNECTIONS:
+            return True
+        if port not in self._crowded:
+            self._crowded.add(port)
+            self._say(f"{port}: {CONNECTIONS} connections are open; silent ones give way, others are refused")
+        for writer, name in self._silent.items():
+            if name == port:
+                del self._silent[writer]
+                self._open[port].discard(writer)
+                writer.transport.abort()
+                return True
+        return False
 
     def _advance(self) -> None:
         """Hold the command of the program for a period."""
@@ -208,7 +236,10 @@ class Server:
         self._clients.add(own)
         try:
             while (got := await wire.read_packet(reader)) is not None:
+                self._silent.pop(writer, None)
                 self._answer(own, *got)
+                if got[0] != "U":
+                    await writer.drain()
                 own.packets += 1
                 if own.packets > PACKETS_A_PERIOD and not self._lockstep:
                     await self._turn.wait()
@@ -216,19 +247,18 @@ class Server:
             self._clients.discard(own)
 
     def _answer(self, own: Client, kind: str, body: bytes) -> None:
-        """Answer a packet of a client, or raise a `WireError` where no client sends such a one."""
+        """Answer a packet of a client, or raise a `WireError` where its body makes no sense."""
         answers: dict[str, Callable[[], bytes]] = {
-            "V": lambda: bytes([body == b"\x00\x02"]), "v": lambda: struct.pack(">4I", *wire.CONTROLLER["version"]),
+            "V": lambda: bytes([body == b"\x00\x02"]),
+            "v": lambda: struct.pack(">4I", *wire.CONTROLLER["version"]),
             "O": lambda: self._subscribe(own, body), "I": lambda: self._admit(own, body), "P": lambda: b"\x01",
             "S": lambda: bytes([own.outputs is not None]),
         }  # fmt: skip
         if kind == "U":
             self._receive(own, body)
-        elif kind in answers:
+        else:
             own.writer.write(wire.packet(kind, answers[kind]()))
             own.started = kind == "S" or (own.started and kind != "P")
-        else:
-            raise wire.WireError(f"kind {kind!r} of packet is none that a client sends")
 
     def _subscribe(self, own: Client, body: bytes) -> bytes:
         """Take the recipe of the outputs that a client wants."""
@@ -288,27 +318,41 @@ class Server:
 
     async def _script(self, reader: StreamReader, writer: StreamWriter) -> None:
         script = b""
-        while data := await reader.read(LINE_SIZE):
-            *whole, script = (script + data).split(b"\nend\n")
-            for version, known in (script_version(each + b"\nend\n") for each in whole):
-                if not known:
-                    self._say(f"a script is not carried out: {version}; served is that of ur-rtde 1.6.5")
-                elif self.program.stopped_at is not None:
-                    self._say("the control program does not start: the robot is in a protective stop")
-                else:
-                    self._say(f"control program of {version}")
-                    self.program.begin()
+        while data := await reader.read(wire.MAX_LINE):
+            *whole, script = (script + data).split(SCRIPT_END)
+            for each in whole:
+                self._silent.pop(writer, None)
+                self._load(each + SCRIPT_END)
+            if not begins_script(script):
+                raise wire.WireError(f"{script[:20]!r} does not begin a script")
             if len(script) > SCRIPT_SIZE:
                 raise wire.WireError(f"a script must be at most {SCRIPT_SIZE} bytes")
         if script:
             raise wire.WireError(f"{len(script)} bytes that are no control script are not carried out")
 
+    def _load(self, script: bytes) -> None:
+        """Begin the control program of a script, or raise a `WireError` for bytes that are none."""
+        if not begins_script(script):
+            raise wire.WireError(f"{script[:20]!r} does not begin a script")
+        version, known = script_version(script)
+        if not known:
+            self._say(f"a script is not carried out: {version}; served is that of ur-rtde 1.6.5")
+        elif self.program.stopped_at is not None:
+            self._say("the control program does not start: the robot is in a protective stop")
+        else:
+            self._say(f"control program of {version}")
+            self.program.begin()
+
     async def _dashboard(self, reader: StreamReader, writer: StreamWriter) -> None:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
-        words = ""
-        while words != "quit" and (line := await reader.readline()):
-            words = line.decode("ascii", "replace").strip()
+        async for words in wire.read_lines(reader):
+            if writer.is_closing():
+                break
+            self._silent.pop(writer, None)
             writer.write(self._reply(words).encode() + b"\n")
+            await writer.drain()
+            if words == "quit":
+                break
 
     def _reply(self, words: str) -> str:
         """Return the answer to a command of the dashboard, in its own words."""
@@ -330,11 +374,12 @@ class Server:
 
     async def _features(self, reader: StreamReader, writer: StreamWriter) -> None:
         self._watchers[writer] = False
+        del self._silent[writer]  # since it need not say anything
         if self._lockstep:
             self._tell([writer])
-        while line := await reader.readline():
-            if line.strip() != b"pictures":
-                raise wire.WireError(f"wanted is the word pictures, got {len(line)} other bytes")
+        async for words in wire.read_lines(reader):
+            if words != "pictures":
+                raise wire.WireError(f"wanted is the word pictures, got {words[:20]!r}")
             self._watchers[writer] = True
 
     def _tell(self, writers: Iterable[StreamWriter]) -> None:

@@ -2,12 +2,16 @@
 
 A packet is big-endian: u16 size of the whole, u8 kind, body. A recipe is a list of variables that travel together.
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+
+No request of HTTP begins a packet: its first byte is a printable character or the end of a line, and so is its second
+one, which as a size is above that of any packet. A TLS record begins with 0x16, likewise too large.
 """
 
 import asyncio
+import re
 import struct
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -16,6 +20,13 @@ from typing import Any, Final, Self
 
 CONTROLLER: Final = tomllib.loads(files(__package__).joinpath("controller.toml").read_text(encoding="utf-8"))
 MAX_NAMES: Final = 2048  # bytes of a list of names, by the guide
+MAX_PACKET: Final = 3 + 8 + MAX_NAMES  # bytes of a packet of a client: a list of names with its frequency
+SIZES: Final = {"V": 5, "v": 3, "S": 3, "P": 3}  # bytes of the packets that have one size only
+KINDS: Final = {*SIZES, "O", "I", "U"}  # those that a client sends
+MAX_LINE: Final = 4096  # bytes
+FOREIGN: Final = re.compile(
+    rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]"
+)  # HTTP, or bytes that are no text
 NOT_FOUND: Final = "NOT_FOUND"
 CODES: Final = CONTROLLER["codes"]  # type -> layout of struct
 ZEROS: Final = {kind: (0,) * int(code[:-1] or 1) for kind, code in CODES.items()}
@@ -84,13 +95,48 @@ def packet(kind: str, body: bytes) -> bytes:
 
 
 async def read_packet(reader: asyncio.StreamReader) -> tuple[str, bytes] | None:
-    """Return kind and body of the next packet, None at the end, or raise a `WireError` where it has no size or end."""
+    """Return kind and body of the next packet, None at the end, or raise a `WireError` where it has no size or end.
+
+    Kind and size are judged before the body is awaited.
+    """
     try:
-        size, kind = struct.unpack(">HB", await reader.readexactly(3))
-        if size >= 3:
-            return chr(kind), await reader.readexactly(size - 3)
+        head = await reader.readexactly(3)
+        kind = chr(head[2])
+        size = int.from_bytes(head[:2])
+        check_head(kind, size)
+        return kind, await reader.readexactly(size - 3)
     except asyncio.IncompleteReadError as error:
         if not error.partial and error.expected == 3:
             return None
         raise WireError(f"the stream ends within a packet, after {len(error.partial)} bytes") from None
-    raise WireError(f"a packet must have at least 3 bytes, got a size of {size}")
+
+
+def check_head(kind: str, size: int) -> None:
+    """Raise a `WireError` where no client sends a packet of this kind and size."""
+    if not 3 <= size <= MAX_PACKET:
+        start = size.to_bytes(2)
+        raise WireError(f"a packet must have 3 to {MAX_PACKET} bytes, got a size of {size} ({start!r})")
+    if kind not in KINDS:
+        raise WireError(f"kind {kind!r} of packet is none that a client sends")
+    if size != SIZES.get(kind, size):
+        raise WireError(f"a packet of kind {kind!r} must have {SIZES[kind]} bytes, got a size of {size}")
+
+
+async def read_lines(reader: asyncio.StreamReader) -> AsyncIterator[str]:
+    """Yield lines without their ends, or raise a `WireError` as soon as one is too long, HTTP or no text."""
+    rest = b""
+    while data := await reader.read(MAX_LINE):
+        *lines, rest = (rest + data).split(b"\n")
+        for line in lines:
+            yield _read_line(line)
+        _read_line(rest)
+    if rest:
+        yield _read_line(rest)
+
+
+def _read_line(line: bytes) -> str:
+    if len(line) > MAX_LINE:
+        raise WireError(f"a line must have at most {MAX_LINE} bytes")
+    if FOREIGN.match(line):
+        raise WireError(f"{line[:20]!r} is HTTP, TLS or no text")
+    return line.decode("ascii", "replace").strip()

@@ -8,7 +8,9 @@ import hashlib
 import json
 import math
 import random
+import socket
 import struct
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -22,7 +24,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.resolution import resolve
 from servobench.harness.serve.program import ControlProgram, profile, script_version
-from servobench.harness.serve.server import Server
+from servobench.harness.serve.server import CONNECTIONS, PORTS, Server
 from servobench.harness.serve.wire import CONTROLLER, INPUTS, NOT_FOUND, OUTPUTS, Recipe, WireError
 from servobench.plant.bench.plant import TrueModel
 from servobench.plant.contract.faults import Collision, ConfigurationError
@@ -339,8 +341,11 @@ def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
 @pytest.mark.parametrize(
     ("port", "sent", "said"),
     [
-        ("RTDE", b"\x00\x01V", "RTDE: a packet must have at least 3 bytes, got a size of 1"),
-        ("RTDE", b"\x00\x09V\x00", "RTDE: the stream ends within a packet, after 1 bytes"),
+        ("RTDE", b"\x00\x01V", "RTDE: a packet must have 3 to 2059 bytes, got a size of 1"),
+        ("RTDE", b"\x00\x09I\x00", "RTDE: the stream ends within a packet, after 1 bytes"),
+        ("RTDE", packed("S", b"\x00"), "RTDE: a packet of kind 'S' must have 3 bytes, got a size of 4"),
+        ("RTDE", packed("P", b"\x00"), "RTDE: a packet of kind 'P' must have 3 bytes, got a size of 4"),
+        ("RTDE", packed("V", b"\x02"), "RTDE: a packet of kind 'V' must have 5 bytes, got a size of 4"),
         ("RTDE", packed("x"), "RTDE: kind 'x' of packet is none that a client sends"),
         ("RTDE", packed("U", b"\x07abc"), "RTDE: data are of recipe 7, which this client has not set up"),
         ("RTDE", packed("O", b"abc"), "RTDE: outputs need a frequency of 1 to 500 Hz, got 0"),
@@ -349,7 +354,7 @@ def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
         ("RTDE", packed("I", b"input_int_register_0") + packed("U", b"\x01abc"), "must be 4 bytes, got 3"),
         ("dashboard", b"x" * 9000, "dashboard: a line must have at most 4096 bytes"),
         ("script", b"def nothing", "script: 11 bytes that are no control script are not carried out"),
-        ("features", b"more\n", "features: wanted is the word pictures, got 5 other bytes"),
+        ("features", b"more\n", "features: wanted is the word pictures, got 'more'"),
     ],
 )
 def test_bytes_that_make_no_sense_are_a_line_and_the_end_of_their_connection(lockstep, port, sent, said):
@@ -362,6 +367,109 @@ def test_bytes_that_make_no_sense_are_a_line_and_the_end_of_their_connection(loc
         )
         while line.recv(65536):
             pass
+
+
+MOVE = packed("I", ",".join(SPEED).encode()) + packed(
+    "U", b"\x01" + struct.pack(">i8d", 1, *[0.5] * 6, 1.0, 1.0)
+)  # a recipe and moveJ
+METHODS = (
+    "GET", "POST", "HEAD", "OPTIONS", "PUT", "DELETE", "PATCH", "TRACE", "PROPFIND", "COPY", "MOVE", "UNLOCK",
+    "post", "S", "P", "!", "PO", "def", "stop",
+)  # fmt: skip
+FOREIGN = [
+    *(f"{each} / HTTP/1.1\r\n".encode() for each in METHODS),
+    b"CONNECT 127.0.0.1:30004 HTTP/1.1\r\n", b"POST http://127.0.0.1:29999/ HTTP/1.1\r\n", b"GET /\r\n",
+    b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET /chat HTTP/1.1\r\nUpgrade: websocket\r\n",
+    b"\r\n\r\nPOST / HTTP/1.1\r\n", b"\n\nOPTIONS / HTTP/1.1\r\n", b"POST /" + b"x" * 5000 + b" HTTP/1.1\r\n",
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"\x80\x2e\x01\x03\x01\x00\x15\x00",  # TLS, and that of before
+    b"\x00\x03\x00\x1c\x21\x12\xa4\x42",  # STUN on TCP, as a page opens it
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("port", PORTS)
+@pytest.mark.parametrize("piece", [1 << 20, 1, 7])
+def test_a_browser_closes_its_connection_with_its_first_line_and_nothing_moves(lockstep, monkeypatch, port, piece):
+    """After the first line comes what a port carries out, if it reads that line as a packet, a script or a command."""
+    server, address, lines = lockstep
+    monkeypatch.setattr("servobench.harness.serve.server.script_version", lambda _: ("a test", True))
+    server.program.begin()
+    before = server.rollout.k, dict(server.program.inputs)
+    for first in FOREIGN:
+        size = int.from_bytes(first[:2])
+        bodies = {
+            "RTDE": first.ljust(size, b"x") + MOVE,
+            "script": first + b"\r\n\nend\ndef rtde_control():\nend\n",
+            "dashboard": first + b"Host: localhost\r\n\r\nstop\nunlock protective stop\n",
+            "features": first + b"\r\npictures\n",
+        }
+        said = len(lines)
+        with connected(address, port) as line:
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            body = bodies[port]
+            with suppress(ConnectionError):
+                for k in range(0, min(len(body), 2000 * piece), piece):
+                    line.sendall(body[k : k + piece])
+                while line.recv(65536):
+                    pass
+        assert any(each.startswith(f"{port}: ") for each in lines[said:]), (first, lines[said:])
+    assert not server._watchers
+    assert server.program.running
+    assert (server.rollout.k, server.program.inputs) == before
+    assert not any("control program" in each for each in lines[-len(FOREIGN) :])
+
+
+def test_the_script_port_keeps_a_client_whose_script_is_not_served_and_reads_it_in_pieces(lockstep, monkeypatch):
+    _, address, lines = lockstep
+    known = b"def rtde_control():\n  pass\nend\n"
+    monkeypatch.setattr("servobench.harness.serve.server.script_version", lambda each: ("a test", each == known))
+    said = len(lines)
+    with connected(address, "script") as line:
+        for byte in b"def custom():\n  textmsg(1)\nend\n" + known:
+            line.sendall(bytes([byte]))
+        assert waited_for(lambda: "control program of a test" in lines[said:]), lines
+        assert sum("a script is not carried out: a test" in each for each in lines[said:]) == 1
+        line.sendall(b"\nend\n" + known)
+        assert line.recv(10) == b""
+    assert lines[-1] == r"script: b'\nend\n' does not begin a script; the connection is closed"
+
+
+def test_silent_connections_give_way_and_none_that_has_spoken_or_listens_does():
+    with served() as (server, address, lines), ExitStack() as stack:
+        client = stack.enter_context(closing(Bytes(address)))
+        dashboard, features = (stack.enter_context(connected(address, port)) for port in ("dashboard", "features"))
+        answers, frames = (stack.enter_context(each.makefile("rb")) for each in (dashboard, features))
+        dashboard.sendall(b"running\n")
+        assert [answers.readline(), answers.readline()][1] == b"Program running: false\n"
+        frames.readline()
+        for port in PORTS:
+            for _ in range(3 * CONNECTIONS):
+                stack.enter_context(connected(address, port)).sendall(b"\x00" if port == "RTDE" else b"d")
+        assert waited_for(lambda: all(len(each) == CONNECTIONS for each in server._open.values()))
+        assert [len(each) for each in server._open.values()] == [CONNECTIONS] * len(PORTS)
+        late = stack.enter_context(closing(Bytes(address)))
+        assert (late.start(), client.start()) == (b"\x01", b"\x01")
+        dashboard.sendall(b"robotmode\n")
+        assert answers.readline() == b"Robotmode: RUNNING\n"
+        client.set_up(*SPEED)
+        server.program.begin()
+        client.command(9, *[0.1] * 6, 1.0, 0.05)
+        assert json.loads(frames.readline())["time"] > 0.0
+        assert sum("32 connections are open" in each for each in lines) == len(PORTS)
+        assert not any("stream ends" in each for each in lines)
+
+
+def test_a_client_that_goes_away_amid_its_packets_leaves_no_warning(lockstep, caplog):
+    _, address, _ = lockstep
+    for _ in range(5):
+        line = connected(address, "RTDE")
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        line.sendall(packed("v") * 2000)
+        line.recv(100)
+        line.close()
+    client = Bytes(address)
+    assert client.start() == b"\x01"
+    client.close()
+    assert not caplog.records
 
 
 def test_no_random_bytes_end_the_server(lockstep):
