@@ -44,6 +44,7 @@ PACKETS_A_PERIOD: Final = 50  # packets of a client in a period; the others wait
 SCRIPT_SIZE: Final = 1 << 20  # bytes of a script at most
 SCRIPT_END: Final = b"\nend\n"
 CONNECTIONS: Final = 32  # to a port at once
+LEGACY_FREQUENCY: Final = 125.0  # [Hz], at which version 1 of RTDE sends outputs
 
 
 @dataclass(eq=False)
@@ -51,6 +52,8 @@ class Client:
     """A connection to the RTDE port."""
 
     writer: StreamWriter
+    version: int = 0  # the protocol's, once the client has shown it
+    number: bytes = b""  # that begins data: the recipe's, which version 1 leaves out
     outputs: wire.Recipe | None = None
     every: int = 1  # periods of the controller between two packets
     started: bool = False
@@ -229,7 +232,7 @@ class Server:
             each.packets = 0
             due = each.started and (self._lockstep or self._sent % each.every == 0)
             if due and each.outputs is not None and _ready(each.writer):
-                each.writer.write(wire.packet("U", b"\x01" + each.outputs.pack(self.state)))
+                each.writer.write(wire.packet("U", each.number + each.outputs.pack(self.state)))
 
     async def _rtde(self, reader: StreamReader, writer: StreamWriter) -> None:
         own = Client(writer)
@@ -249,26 +252,45 @@ class Server:
     def _answer(self, own: Client, kind: str, body: bytes) -> None:
         """Answer a packet of a client, or raise a `WireError` where its body makes no sense."""
         answers: dict[str, Callable[[], bytes]] = {
-            "V": lambda: bytes([body == b"\x00\x02"]),
+            "V": lambda: self._negotiate(own, int.from_bytes(body)),
             "v": lambda: struct.pack(">4I", *wire.CONTROLLER["version"]),
             "O": lambda: self._subscribe(own, body), "I": lambda: self._admit(own, body), "P": lambda: b"\x01",
             "S": lambda: bytes([own.outputs is not None]),
         }  # fmt: skip
         if kind == "U":
             self._receive(own, body)
+        elif kind == "M":
+            self._say(f"message of a client: {wire.read_message(body, own.version)!r}")
         else:
             own.writer.write(wire.packet(kind, answers[kind]()))
             own.started = kind == "S" or (own.started and kind != "P")
 
+    def _negotiate(self, own: Client, version: int) -> bytes:
+        """Take the version of the protocol that a client wants."""
+        accepted = version in (1, 2)
+        if accepted:
+            own.version = version
+        else:
+            self._say(f"version {version} of RTDE is refused; served are 1 and 2")
+        return bytes([accepted])
+
     def _subscribe(self, own: Client, body: bytes) -> bytes:
         """Take the recipe of the outputs that a client wants."""
-        frequency = struct.unpack(">d", body[:8])[0] if len(body) > 8 else 0.0
+        if own.version == 0 and body[:1].isalpha():  # as no frequency begins: version 1, with which a UR begins
+            own.version = 1
+        frequency = LEGACY_FREQUENCY
+        names = body
+        own.number = b""
+        if own.version != 1:
+            frequency = struct.unpack(">d", body[:8])[0] if len(body) >= 8 else 0.0
+            names = body[8:]
+            own.number = b"\x01"
         if not 1.0 <= frequency <= RATE:
             raise wire.WireError(f"outputs need a frequency of 1 to {RATE:g} Hz, got {frequency:g}")
-        recipe = self._recipe(body[8:], wire.OUTPUTS)
+        recipe = self._recipe(names, wire.OUTPUTS)
         own.outputs = None if wire.NOT_FOUND in recipe.types else recipe
         own.every = max(1, round(1.0 / (frequency * self._spec.period)))
-        return b"\x01" + ",".join(recipe.types).encode()
+        return own.number + ",".join(recipe.types).encode()
 
     def _admit(self, own: Client, body: bytes) -> bytes:
         """Take a recipe of inputs of a client, if no other client writes one of them."""
@@ -286,7 +308,9 @@ class Server:
 
     def _recipe(self, body: bytes, known: dict[str, str]) -> wire.Recipe:
         recipe = wire.Recipe.of(body, known)
-        if wire.NOT_FOUND in recipe.types:
+        if recipe.names == ("",):
+            self._say("a recipe without variables sets up nothing")
+        elif wire.NOT_FOUND in recipe.types:
             name = recipe.names[recipe.types.index(wire.NOT_FOUND)][:40]
             self._say(f"{recipe.types.count(wire.NOT_FOUND)} variables are not served, the first is {name!r}")
         return recipe

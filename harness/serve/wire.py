@@ -1,7 +1,8 @@
 """RTDE packets: the variables of a UR's controller, recipes of them, and the bytes on the socket.
 
 A packet is big-endian: u16 size of the whole, u8 kind, body. A recipe is a list of variables that travel together.
-Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol versions 1 and 2; what version 1 leaves out
+agrees with Universal Robots' client library.
 
 No request of HTTP begins a packet: its first byte is a printable character or the end of a line, and so is its second
 one, which as a size is above that of any packet. A TLS record begins with 0x16, likewise too large.
@@ -22,7 +23,7 @@ CONTROLLER: Final = tomllib.loads(files(__package__).joinpath("controller.toml")
 MAX_NAMES: Final = 2048  # bytes of a list of names, by the guide
 MAX_PACKET: Final = 3 + 8 + MAX_NAMES  # bytes of a packet of a client: a list of names with its frequency
 SIZES: Final = {"V": 5, "v": 3, "S": 3, "P": 3}  # bytes of the packets that have one size only
-KINDS: Final = {*SIZES, "O", "I", "U"}  # those that a client sends
+KINDS: Final = {*SIZES, "O", "I", "U", "M"}  # those that a client sends
 MAX_LINE: Final = 4096  # bytes
 FOREIGN: Final = re.compile(
     rb"[A-Z]+ |.*(?i:http)/\d|.*[\x00-\x08\x0b\x0c\x0e-\x1f]"
@@ -61,10 +62,14 @@ class Recipe:
 
     @classmethod
     def of(cls, body: bytes, known: Mapping[str, str]) -> Self:
-        """Return the recipe of a comma-separated list of known variables, or raise a `WireError` for no such list."""
+        """Return the recipe of a comma-separated list of known variables, or raise a `WireError` for no such list.
+
+        A list without names has one that is not found.
+        """
         names = tuple(name for name in body.decode("ascii", "replace").split(",") if name)
-        if len(body) > MAX_NAMES or not body.isascii() or not names:
-            raise WireError(f"a recipe must be 1 to {MAX_NAMES} bytes of names, got {len(body)} bytes")
+        if len(body) > MAX_NAMES or not body.isascii():
+            raise WireError(f"a recipe must be at most {MAX_NAMES} bytes of names, got {len(body)}, {body[:20]!r}")
+        names = names or ("",)
         return cls(names, tuple(known.get(name, NOT_FOUND) for name in names))
 
     @cached_property
@@ -120,6 +125,24 @@ def check_head(kind: str, size: int) -> None:
         raise WireError(f"kind {kind!r} of packet is none that a client sends")
     if size != SIZES.get(kind, size):
         raise WireError(f"a packet of kind {kind!r} must have {SIZES[kind]} bytes, got a size of {size}")
+
+
+def read_message(body: bytes, version: int) -> str:
+    """Return the text of a message, or raise a `WireError` where its parts do not fill it.
+
+    Version 1 sends level and text, version 2 length, text, length, source and level.
+    """
+    end = len(body)
+    whole = end > 0
+    if version == 2:
+        try:
+            end = 1 + body[0]
+            whole = len(body) == end + body[end] + 2
+        except IndexError:
+            whole = False
+    if not whole:
+        raise WireError(f"a text message must be as long as its parts say, got {len(body)} bytes")
+    return body[1:end].decode("ascii", "replace")
 
 
 async def read_lines(reader: asyncio.StreamReader) -> AsyncIterator[str]:

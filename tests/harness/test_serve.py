@@ -31,6 +31,8 @@ from servobench.plant.contract.faults import Collision, ConfigurationError
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command
 
+VERSION_2 = packed("V", b"\x00\x02")
+
 
 @pytest.fixture(scope="module")
 def lockstep():
@@ -62,10 +64,12 @@ def test_values_come_back_as_they_were_packed(names, data):
     assert recipe.unpack(recipe.pack(values)) == values
 
 
-def test_a_list_without_names_is_no_recipe():
-    for body in (b"", b",,", b"\xff", b"a," * 1025):
-        with pytest.raises(WireError, match="a recipe must be 1 to 2048 bytes of names"):
+def test_bytes_that_are_no_list_of_names_are_no_recipe():
+    for body in (b"\xff", b"a," * 1025):
+        with pytest.raises(WireError, match="a recipe must be at most 2048 bytes of names"):
             Recipe.of(body, OUTPUTS)
+    for body in (b"", b",,"):
+        assert Recipe.of(body, OUTPUTS).types == (NOT_FOUND,)
     assert Recipe.of(b"actual_q,nonsense,", OUTPUTS).types == ("VECTOR6D", NOT_FOUND)
     assert Recipe.of(b"actual_q", INPUTS).types == (NOT_FOUND,)
 
@@ -346,9 +350,10 @@ def test_a_plant_that_cannot_go_on_is_a_protective_stop_that_stays(monkeypatch):
         ("RTDE", packed("S", b"\x00"), "RTDE: a packet of kind 'S' must have 3 bytes, got a size of 4"),
         ("RTDE", packed("P", b"\x00"), "RTDE: a packet of kind 'P' must have 3 bytes, got a size of 4"),
         ("RTDE", packed("V", b"\x02"), "RTDE: a packet of kind 'V' must have 5 bytes, got a size of 4"),
+        ("RTDE", VERSION_2 + packed("M", b"\x05hell"), "RTDE: a text message must be as long as its parts say, got 5"),
         ("RTDE", packed("x"), "RTDE: kind 'x' of packet is none that a client sends"),
         ("RTDE", packed("U", b"\x07abc"), "RTDE: data are of recipe 7, which this client has not set up"),
-        ("RTDE", packed("O", b"abc"), "RTDE: outputs need a frequency of 1 to 500 Hz, got 0"),
+        ("RTDE", VERSION_2 + packed("O", b"abc"), "RTDE: outputs need a frequency of 1 to 500 Hz, got 0"),
         ("RTDE", packed("O", struct.pack(">d", 5e-324) + b"actual_q"), "of 1 to 500 Hz, got 4.94066e-324"),
         ("RTDE", packed("O", struct.pack(">d", math.nan) + b"actual_q"), "of 1 to 500 Hz, got nan"),
         ("RTDE", packed("I", b"input_int_register_0") + packed("U", b"\x01abc"), "must be 4 bytes, got 3"),
@@ -431,6 +436,38 @@ def test_the_script_port_keeps_a_client_whose_script_is_not_served_and_reads_it_
         line.sendall(b"\nend\n" + known)
         assert line.recv(10) == b""
     assert lines[-1] == r"script: b'\nend\n' does not begin a script; the connection is closed"
+
+
+def test_version_1_has_neither_frequency_nor_number_of_outputs(lockstep):
+    _, address, lines = lockstep
+    names = b"timestamp,output_int_register_3"
+    for version in (packed("V", b"\x00\x01"), b""):  # a UR begins with it
+        with connected(address, "RTDE") as line, line.makefile("rb") as stream:
+            line.sendall(version + packed("O", names) + packed("S"))
+            assert stream.read(len(version and b"...1")) == (version and packed("V", b"\x01"))
+            assert stream.read(15) == packed("O", b"DOUBLE,INT32")
+            assert stream.read(4) == packed("S", b"\x01")
+            assert stream.read(15)[:3] == struct.pack(">HB", 15, ord("U"))
+            assert stream.read(15)[:3] == struct.pack(">HB", 15, ord("U"))
+    with connected(address, "RTDE") as line:
+        line.sendall(packed("V", b"\x00\x09"))
+        assert line.recv(10) == packed("V", b"\x00")
+    assert "version 9 of RTDE is refused; served are 1 and 2" in lines
+
+
+def test_a_message_is_a_line_and_an_empty_recipe_is_not_found(lockstep):
+    _, address, lines = lockstep
+    client = Bytes(address)
+    client.socket.sendall(packed("M", b"\x05hel\x1bo\x03abc\x01"))
+    assert client.asked("O", struct.pack(">d", 125.0)) == b"\x01NOT_FOUND"
+    assert client.start() == b"\x00"
+    assert client.set_up("") == (0, [NOT_FOUND])
+    client.asked("V", b"\x00\x01")
+    client.socket.sendall(packed("M", b"\x03of version 1"))
+    assert client.asked("P") == b"\x01"
+    client.close()
+    assert {r"message of a client: 'hel\x1bo'", "message of a client: 'of version 1'"} < {*lines}
+    assert lines.count("a recipe without variables sets up nothing") == 2
 
 
 def test_silent_connections_give_way_and_none_that_has_spoken_or_listens_does():
