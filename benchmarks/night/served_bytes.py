@@ -23,10 +23,20 @@ NAMES = (*SPEED, "actual_q", "timestamp", "input_int_register_24", "nonsense", "
 WORDS = (b"stop", b"running", b"unlock protective stop", b"play", b"quit", b"PolyscopeVersion", b"\xff\xfe", b"")
 NUMBERS = (0.0, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 1e-9, 0.3)
 
+METHODS = (b"GET", b"POST", b"OPTIONS", b"CONNECT", b"PRI", b"post", b"S", b"!", b"def")
+
+
+def browser(draw):
+    """Return what a browser sends first, by HTTP, TLS or STUN, and behind it what a port carries out."""
+    line = draw.choice(METHODS) + draw.choice((b" / HTTP/1.1\r\n", b" http://x/ HTTP/1.1\r\n", b" * HTTP/2.0\r\n"))
+    first = draw.choice((line, line, b"\r\n" + line, b"\x16\x03\x01\x02\x00\x01", b"\x00\x03\x00\x1c\x21\x12\xa4\x42"))
+    packets = first.ljust(int.from_bytes(first[:2]), b"x") + packed("I", ",".join(SPEED).encode()) + packed("S")
+    return draw.choice((packets, first + b"\nend\ndef rtde_control():\nend\n", first + b"\r\n\r\nstop\npictures\n"))
+
 
 def wire(draw):
     """Return packets that are right, wrong in one place, or nothing of the kind."""
-    match draw.randrange(7):
+    match draw.randrange(8):
         case 0:
             return draw.randbytes(draw.randrange(1, 80))
         case 1:
@@ -41,6 +51,9 @@ def wire(draw):
             return whole[: draw.randrange(1, len(whole))]
         case 5:
             return struct.pack(">HB", draw.randrange(65536), draw.randrange(256)) + draw.randbytes(20)
+        case 6:
+            version = packed("V", struct.pack(">H", draw.randrange(4)))
+            return version + packed("M", draw.randbytes(draw.randrange(8))) + packed("O", b"timestamp,actual_q")
         case _:
             body = struct.pack(">i8d", draw.randrange(-3, 260), *draw.choices(NUMBERS, k=8))
             number = draw.choice((b"\x01", b"\x01", b"\x01", b"\x02", b"\x00"))
@@ -49,6 +62,8 @@ def wire(draw):
 
 def inputs(port, draw):
     """Return an input for a port."""
+    if draw.randrange(10) == 0:
+        return browser(draw)
     if port == "RTDE":
         return wire(draw)
     if port == "dashboard":
