@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
-from servobench.harness.batch.processes import Bounds, Limits, available_processors
+from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile
@@ -411,6 +411,8 @@ def open_workers(
     if count == 1 and limits == Limits():
         yield Workers()
         return
+    if limits.memory < math.inf and not can_watch():
+        remark("the memory and the processes of a run cannot be watched here, only its time: /proc does not say them")
     pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)))
     try:
         yield Workers(pool.submit, count)

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
@@ -23,11 +24,13 @@ from typing import Any, Final
 
 import psutil
 
+from servobench.harness.batch.container import memory_limit, processor_limit
+
 LINUX: Final = sys.platform == "linux"  # of the other systems, macOS is provided for
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
-FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
-LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least
+FOREIGN_SHARE: Final = 0.8  # share of the memory for all concurrent runs of foreign code
+LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least, on a machine that is no container
 END_TIME, END_PAUSE = 5.0, 0.01  # [s] until all processes below this one have ended, and between two checks
 
 
@@ -50,16 +53,26 @@ class Bounds:
 
     def limits(self, count: int, *, foreign: bool) -> Limits:
         """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
-        share = FOREIGN_SHARE * psutil.virtual_memory().total / count
-        usual = Limits(FOREIGN_TIME, max(LEAST_FOREIGN_MEMORY, share)) if foreign else Limits()
+        usual = Limits(FOREIGN_TIME, _foreign_memory(count)) if foreign else Limits()
         time = usual.time if self.run_timeout is None else self.run_timeout
         memory = usual.memory if self.run_memory is None else self.run_memory
         return Limits(time, memory, addresses=self.run_memory is not None)
 
 
+def _foreign_memory(count: int) -> float:
+    """Return the memory limit [bytes] of each of `count` concurrent runs of foreign code."""
+    machine = float(psutil.virtual_memory().total)
+    memory = FOREIGN_SHARE * min(machine, memory_limit())
+    share = memory / count
+    if memory_limit() < machine:  # A container ends processes at its limit, whereas a machine can swap.
+        return share
+    return max(share, min(LEAST_FOREIGN_MEMORY, memory))
+
+
 def available_processors() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if LINUX else os.cpu_count() or 1
+    """Return the number of whole processors that this process may use, at least one."""
+    count = len(os.sched_getaffinity(0)) if LINUX else os.cpu_count() or 1
+    return max(1, math.floor(min(count, processor_limit())))
 
 
 def lead_session() -> None:
@@ -110,7 +123,10 @@ def _prctl(option: int, value: int) -> None:
 
 def descendants(process: int) -> list[int]:
     """Return the ids of all processes below one."""
-    found, waiting = [], [process]
+    if not _lists_children():
+        return _ask(process, lambda top: [each.pid for each in top.children(recursive=True)]) or []
+    found: list[int] = []
+    waiting = [process]
     while waiting:
         children = _children(waiting.pop())
         found += children
@@ -118,15 +134,33 @@ def descendants(process: int) -> list[int]:
     return found
 
 
-def _children(process: int) -> list[int]:
-    """Return the ids of the children of a process."""
-    if not LINUX:
-        return _ask(process, lambda each: [child.pid for child in each.children()]) or []
+@cache
+def _lists_children() -> bool:
+    """Return whether the system lists the children of a process; otherwise each process names its parent.
+
+    macOS has no such lists, nor has gVisor or a kernel without CONFIG_PROC_CHILDREN.
+    """
     try:
-        lists = [(task / "children").read_text() for task in Path(f"/proc/{process}/task").iterdir()]
-    except (FileNotFoundError, ProcessLookupError):  # it has ended
-        return []
-    return [int(word) for text in lists for word in text.split()]
+        Path("/proc/thread-self/children").read_text(encoding="ascii")
+    except OSError:
+        return False
+    return True
+
+
+def _children(process: int) -> list[int]:
+    """Return the ids of the children of a process, as the system lists them."""
+    found: list[int] = []
+    with contextlib.suppress(OSError):  # The process has ended.
+        for thread in Path(f"/proc/{process}/task").iterdir():
+            with contextlib.suppress(OSError):  # The thread has ended.
+                words = (thread / "children").read_text(encoding="ascii")
+                found += map(int, words.split())
+    return found
+
+
+def can_watch() -> bool:
+    """Return whether this system says which processes are below one, as limits of memory and processes need it."""
+    return bool(_ask(os.getpid(), lambda own: own.ppid()) == os.getppid())
 
 
 def resident_memory(processes: Iterable[int]) -> int:
@@ -136,8 +170,15 @@ def resident_memory(processes: Iterable[int]) -> int:
 
 def own_memory(processes: Iterable[int]) -> int:
     """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    kind = "pss" if LINUX else "uss"
-    return sum(_ask(process, lambda each: getattr(each.memory_full_info(), kind)) or 0 for process in processes)
+    return sum(_own_memory_of(process) for process in processes)
+
+
+def _own_memory_of(process: int) -> int:
+    """Return the memory [bytes] of a process; all that it shares counts where the system does not say its part."""
+    held = _ask(process, lambda each: each.memory_full_info())
+    if held is None:
+        return resident_memory([process])
+    return int(getattr(held, "pss" if LINUX else "uss", held.rss))
 
 
 def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer

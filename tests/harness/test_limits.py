@@ -5,12 +5,14 @@ import os
 import subprocess
 import sys
 
+import psutil
 import pytest
 
 from kit.command import carried_out
 from servobench.controllers.methods import METHODS
-from servobench.harness.batch import processes
+from servobench.harness.batch import blocks, processes
 from servobench.harness.batch.blocks import open_workers
+from servobench.harness.batch.container import memory_limit, processor_limit
 from servobench.harness.batch.processes import FOREIGN_TIME, LEAST_FOREIGN_MEMORY, Bounds, Limits, read_size, show_size
 from servobench.harness.config.registry import is_foreign_controller, is_foreign_plant
 
@@ -37,6 +39,90 @@ def test_only_foreign_code_has_limits_that_nobody_gave():
     assert not usual.addresses
     assert Bounds(math.inf, math.inf).limits(2, foreign=True) == Limits(addresses=True)
     assert Bounds(3.0, 1e9).limits(2, foreign=False) == Limits(3.0, 10**9, addresses=True)
+
+
+@pytest.mark.parametrize(
+    ("files", "memory", "processors"),
+    [
+        ({"proc/self/cgroup": "0::/", "memory.max": "2000000000", "cpu.max": "100000 100000"}, 2e9, 1.0),
+        ({"memory.max": "2000000000", "cpu.max": "150000 100000"}, 2e9, 1.5),
+        ({"proc/self/cgroup": "0::/a/b", "a/memory.max": "3e9", "a/b/memory.max": "max"}, 3e9, math.inf),
+        ({"proc/self/cgroup": "0::/a/b", "a/cpu.max": "200000 100000", "a/b/cpu.max": "max 100000"}, math.inf, 2.0),
+        ({"proc/self/cgroup": "0::/a", "a/memory.max": "max", "a/memory.high": "1000000000"}, 1e9, math.inf),
+        (
+            {
+                "proc/self/cgroup": "12:cpu,cpuacct:/docker/x\n4:memory:/docker/x\n0::/",
+                "memory/docker/x/memory.limit_in_bytes": "2147483648",
+                "memory/memory.limit_in_bytes": "9223372036854771712",
+                "cpu,cpuacct/docker/x/cpu.cfs_quota_us": "50000",
+                "cpu,cpuacct/docker/x/cpu.cfs_period_us": "100000",
+            },
+            2.0**31,
+            0.5,
+        ),
+        (
+            {
+                "proc/self/cgroup": "4:memory:/docker/unseen\n3:cpu,cpuacct:/docker/unseen",
+                "memory/memory.limit_in_bytes": "4000000000",
+                "cpu/cpu.cfs_quota_us": "-1",
+                "cpu/cpu.cfs_period_us": "100000",
+            },
+            4e9,
+            math.inf,
+        ),
+        ({"proc/self/cgroup": "0::/", "unified/memory.max": "5000000000"}, 5e9, math.inf),
+        ({"proc/self/cgroup": "no line", "memory.max": "", "cpu.max": "0 100000"}, math.inf, math.inf),
+        ({}, math.inf, math.inf),
+    ],
+)  # fmt: skip
+def test_limits_of_a_container_are_those_of_its_group_and_of_the_groups_around_it(files, memory, processors, tmp_path):
+    for name, text in files.items():
+        path = tmp_path / (name if name.startswith("proc") else f"sys/fs/cgroup/{name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{text}\n")
+    assert memory_limit(tmp_path) == memory
+    assert processor_limit(tmp_path) == processors
+
+
+@pytest.mark.parametrize(
+    ("machine", "container", "workers", "wanted"),
+    [
+        (32e9, math.inf, 2, 12.8e9),
+        (4e9, math.inf, 4, 2e9),
+        (1e9, math.inf, 1, 0.8e9),
+        (32e9, 2e9, 1, 1.6e9),
+        (32e9, 2e9, 2, 0.8e9),
+    ],
+)
+def test_foreign_code_gets_a_share_of_the_memory_that_is_there(machine, container, workers, wanted, monkeypatch):
+    total = psutil.virtual_memory()._replace(total=machine)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: total)
+    monkeypatch.setattr(processes, "memory_limit", lambda: container)
+    assert Bounds().limits(workers, foreign=True).memory == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(("limit", "wanted"), [(0.5, 1), (1.0, 1), (1.9, 1)])
+def test_workers_are_as_many_as_whole_processors(limit, wanted, monkeypatch):
+    monkeypatch.setattr(processes, "processor_limit", lambda: limit)
+    assert processes.available_processors() == wanted
+
+
+def test_memory_counts_as_a_whole_where_the_system_does_not_say_which_part_is_shared(monkeypatch):
+    def refuse(process):
+        raise psutil.AccessDenied(process.pid)
+
+    monkeypatch.setattr(psutil.Process, "memory_full_info", refuse)
+    assert processes.own_memory([os.getpid()]) > 10e6
+
+
+def test_a_system_that_hides_processes_is_named_where_there_are_limits(monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(blocks, "remark", said.append)
+    monkeypatch.setattr(processes, "_ask", lambda *_: None)
+    for limit in (math.inf, 1e9):
+        with open_workers(1, bounds=Bounds(run_memory=limit), plants=("kinematic",), controllers=("constant",)):
+            pass
+    assert [line.partition(",")[0] for line in said] == ["the memory and the processes of a run cannot be watched here"]
 
 
 def test_methods_of_this_package_are_not_foreign_and_everything_else_is():
@@ -74,7 +160,10 @@ time.sleep(60)
 """
 
 
-def test_processes_below_one_are_found_with_their_memory():
+@pytest.mark.parametrize("listed", [True, False])
+def test_processes_below_one_are_found_with_their_memory(listed, monkeypatch):
+    if not listed:  # as gVisor's kernel
+        monkeypatch.setattr(processes, "_lists_children", lambda: False)
     with subprocess.Popen([sys.executable, "-S", "-c", FAMILY], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
         try:
