@@ -236,7 +236,7 @@ def check_same_batch(folder: Path, manifest: Mapping[str, Any], note: Callable[[
         raise ConfigurationError(
             f"{folder} was begun with another version of {changed}; {remedy}, or bring the former one back"
         )
-    for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
+    for key, things in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines"), ("blas", "BLAS")):
         if there.get(key) != manifest.get(key):
             note(f"note: {folder} was begun with other {things}; later runs may differ")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch.plan import Survey
-from servobench.harness.config.installation import git_commit, installed_version
+from servobench.harness.config.installation import blas_libraries, git_commit, installed_version, why_unknown_commit
 from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
@@ -64,9 +64,11 @@ def describe_batch(
         "changed": flatten(changed),
         "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
         "packages": {name: installed_version(name) for name in PACKAGES},
+        "blas": blas_libraries(),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "git_commit": git_commit(),
+        "git_commit_unknown": why_unknown_commit(),
         "side_by_side": dict(side_by_side),
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),

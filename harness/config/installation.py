@@ -1,12 +1,13 @@
 """The installation: version and commit of servobench, and the extras that bring missing packages."""
 
+import os
 import subprocess
 import sys
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from servobench.plant.contract.faults import ConfigurationError
 
@@ -65,6 +66,19 @@ def _line(module: str, user: str) -> str:
 
 CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
 COMMIT_DIGITS = 12  # that a reader is shown
+CHECKOUT: Final = Path(__file__).resolve().parents[2]  # folder of the checkout, if this code lies in one
+GIT_TIME: Final = 10.0  # [s] for an answer of git
+OTHER_CHECKOUT: Final = frozenset(  # variables by which a hook of git names a checkout, maybe another one
+    (
+        "GIT_DIR",
+        "GIT_WORK_TREE",
+        "GIT_INDEX_FILE",
+        "GIT_COMMON_DIR",
+        "GIT_OBJECT_DIRECTORY",
+        "GIT_NAMESPACE",
+        "GIT_PREFIX",
+    )
+)
 
 
 @cache  # to read it takes milliseconds, and a manifest has eleven
@@ -76,27 +90,90 @@ def installed_version(name: str = "servobench") -> str | None:
         return None
 
 
+class CommitUnknown(Exception):
+    """The commit of a checkout cannot be told; the message is the reason."""
+
+
 @cache
 def git_commit() -> str | None:
-    """Return the commit of the checkout this code lies in, marked where code differs from it; None outside one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
+    """Return the commit of the checkout this code lies in, marked where code differs from it; None if it is unknown."""
+    try:
+        return _read_commit(CHECKOUT)
+    except CommitUnknown:
         return None
-    commit, changed = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
-    return f"{commit}-dirty" if commit and changed else commit
+
+
+@cache
+def why_unknown_commit() -> str | None:
+    """Return why the commit of a checkout is unknown; None where it is known, or where the code lies in none."""
+    try:
+        _read_commit(CHECKOUT)
+    except CommitUnknown as error:
+        return str(error)
+    return None
 
 
 def version_line() -> str:
     """Return the line that `servobench --version` prints."""
+    line = f"servobench {installed_version() or 'not installed'}"
     commit = git_commit()
-    hash_, dirty, _ = (commit or "").partition("-dirty")
-    where = f" (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})" if commit else ""
-    return f"servobench {installed_version() or 'not installed'}{where}"
+    if commit is not None:
+        hash_, dirty, _ = commit.partition("-dirty")
+        return f"{line} (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})"
+    reason = why_unknown_commit()
+    return line if reason is None else f"{line} (commit unknown: {reason})"
 
 
-def _git(root: Path, *words: str) -> str | None:
-    try:
-        answer = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
+def blas_libraries() -> list[dict[str, Any]]:
+    """Return the loaded libraries of linear algebra (BLAS): name, version, kernel and number of threads of each.
+
+    A library that threadpoolctl does not know has the name and the version with which numpy was built.
+    """
+    import numpy as np  # noqa: PLC0415 - the version is printed without it
+    from threadpoolctl import threadpool_info  # noqa: PLC0415 - likewise
+
+    found: list[dict[str, Any]] = []
+    for each in threadpool_info():
+        if each["user_api"] == "blas":
+            names = {"kernel": each.get("architecture"), "file": Path(each["filepath"]).name}
+            found.append(
+                {"name": each["internal_api"], "version": each["version"], "threads": each["num_threads"], **names}
+            )
+    if not found:
+        built = np.show_config(mode="dicts")
+        blas = built.get("Build Dependencies", {}).get("blas", {})
+        found.append({"name": blas.get("name"), "version": blas.get("version"), "threads": None, "kernel": None})
+    return found
+
+
+def _read_commit(root: Path) -> str | None:
+    """Return the commit of a checkout, marked where code differs from it; None for a folder that is no checkout.
+
+    Raises:
+        CommitUnknown: git is not there, or refuses to answer.
+    """
+    if not (root / ".git").exists():
         return None
-    return answer.stdout.strip() or None
+    commit = _git(root, "rev-parse", "HEAD")
+    changed = _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(root: Path, *words: str) -> str:
+    environment = {name: value for name, value in os.environ.items() if name not in OTHER_CHECKOUT}
+    environment["LC_ALL"] = "C"
+    try:
+        answer = subprocess.run(
+            ["git", *words], cwd=root, env=environment, capture_output=True, text=True, timeout=GIT_TIME, check=True
+        )
+    except subprocess.CalledProcessError as error:
+        said = str(error.stderr).strip().partition("\n")[0].removeprefix("fatal: ")
+        if "dubious ownership" in said:
+            remedy = f"git config --global --add safe.directory {root}"
+            raise CommitUnknown(f"the checkout belongs to another user; {remedy}") from error
+        raise CommitUnknown(f"git says: {said}") from error
+    except subprocess.TimeoutExpired as error:
+        raise CommitUnknown(f"git took longer than {GIT_TIME:g} s") from error
+    except OSError as error:
+        raise CommitUnknown(f"git cannot be run: {error.strerror}") from error
+    return answer.stdout.strip()
