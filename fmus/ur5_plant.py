@@ -11,7 +11,7 @@ from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.cache import cached
+from servobench.plant.contract.cache import BUILT, cached
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import Delay, NonNegative, settings
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
@@ -52,7 +52,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
     options = ExportOptions(fmi_version, nominal_setup(robot, sensing))
     name = f"{options.identifier}.fmu"
     key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options)}"
-    return cached("fmus", key, lambda folder: export_fmu(folder / name, options)) / name
+    return cached(BUILT, key, lambda folder: export_fmu(folder / name, options)) / name
 
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:

@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from servobench.plant.contract.cache import cached
+from servobench.plant.contract.cache import EXTRACTED, cached
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.files import accessing
@@ -41,7 +41,7 @@ def extract_fmu(path: Path) -> Path:
         if not path.is_file():
             raise ValueError(f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}")
         key = digest(path)[:32]
-    return cached("extracted", key, lambda folder: _extract(path, folder))
+    return cached(EXTRACTED, key, lambda folder: _extract(path, folder))
 
 
 def _extract(path: Path, folder: Path) -> None:

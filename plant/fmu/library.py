@@ -9,10 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from servobench.plant.contract.cache import EXTRACTED, UNFINISHED, cache_folder, forbids_code
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.files import accessing
 from servobench.plant.fmu.description import FmuDescription
 
+NOEXEC_REMEDY: Final = "so no code is loaded from it: let TMPDIR and XDG_CACHE_HOME name folders elsewhere"
 _fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
 
 
@@ -38,7 +40,11 @@ class Library:
                     library = None if description.once_per_process else ctypes.CDLL(str(file))
                     self.loaded = _load_copy(file) if library is None or library._handle in _fatal else library
                 except OSError as error:
-                    raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
+                    remedy = ""
+                    if forbids_code(file):
+                        remedy = f"; it lies on a file system that is mounted noexec, {NOEXEC_REMEDY}"
+                    what = f"the library in {description.path.name} cannot be loaded: {error}{remedy}"
+                    raise ValueError(what) from error
                 return
             if file.parent.is_dir():
                 there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
@@ -66,7 +72,11 @@ class Library:
 
 def _load_copy(file: Path) -> ctypes.CDLL:
     """Load a copy of a library and of its folder, so that it shares no variables with another instance."""
-    with tempfile.TemporaryDirectory(prefix="servobench-", ignore_cleanup_errors=True) as folder:
+    place = min((Path(tempfile.gettempdir()), cache_folder(EXTRACTED)), key=forbids_code)
+    place.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(
+        prefix=f"{UNFINISHED}servobench-", dir=place, ignore_cleanup_errors=True
+    ) as folder:
         return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
 
 
