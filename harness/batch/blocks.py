@@ -37,7 +37,7 @@ from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
 from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config import registry
-from servobench.harness.config.source import SourceFile
+from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
@@ -411,6 +411,7 @@ def open_workers(
     if count == 1 and limits == Limits():
         yield Workers()
         return
+    check_present_folder()
     if limits.memory < math.inf and not can_watch():
         remark("the memory and the processes of a run cannot be watched here, only its time: /proc does not say them")
     pool = Pool(count, limits, (*MODULES, *["pandas"] * (steps or foreign), *registry.own_modules(plants, controllers)))

@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import importlib
 import importlib.util
+import os
 import re
 import site
 import sys
@@ -123,6 +124,36 @@ def present_folder() -> Path:
         return Path.cwd()
     except FileNotFoundError as error:
         raise ConfigurationError("the present folder was deleted; change to one that exists") from error
+
+
+def check_present_folder() -> None:
+    """Refuse a present folder in which no other process can start.
+
+    Raises:
+        ConfigurationError: it was deleted, or this user must not enter it.
+    """
+    folder = present_folder()
+    try:
+        os.chdir(folder)
+    except OSError as error:
+        raise ConfigurationError(
+            f"the present folder {folder} cannot be entered: {reason(error)}; change to another one"
+        ) from error
+
+
+@contextlib.contextmanager
+def same_folder() -> Iterator[None]:
+    """Return to the present folder after code that may change it, so that names of files keep their meaning."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            folder = Path.cwd()
+            stack.callback(_return_to, folder)
+        yield
+
+
+def _return_to(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # It is deleted, or this user must not enter it.
+        os.chdir(folder)
 
 
 def make_importable(folder: Path) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from servobench.controllers.servo import ServoController
 from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
+from servobench.harness.config.source import same_folder
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw
 from servobench.harness.run.knowledge import keep_networks
@@ -52,7 +53,7 @@ def carry_out(
     """
     experiment = build(resolved)
     log, ending = StepLog(experiment.plant.spec, experiment.periods), Ending()
-    with contextlib.closing(experiment.plant) as plant, careful():
+    with same_folder(), contextlib.closing(experiment.plant) as plant, careful():
         try:
             pair = held_to_contract(plant, experiment.controller)
             run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
@@ -93,7 +94,7 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     many, ends = build_together(runs), Ends(len(runs))
     bench, log = cast(Bench, many.plant), ManyLogs(many.plant.spec, many.periods, ends)
     try:
-        with careful(), contextlib.suppress(AllEnded):
+        with same_folder(), careful(), contextlib.suppress(AllEnded):
             servo = ManyServos(cast(ServoController, many.controller).servo, ends)
             seeds = [each.request.seed for each in runs]
             run_loop(ManyBenches(bench, ends), servo, many.desired(), many.loop, seeds, log)

@@ -21,6 +21,7 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings
+from servobench.harness.config.source import same_folder
 from servobench.harness.run.knowledge import network_source, nominal_knowledge
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.request import RunRequest, RunSettings, find_robot, find_sensing, sensing_file
@@ -113,7 +114,8 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
         why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
         raise ConfigurationError(f"task {name}: {why}")
     with configuration_errors(f"task {name}: "):
-        scenario: object = task.scenario(setting)  # of a user's task it may be anything
+        with same_folder():
+            scenario: object = task.scenario(setting)  # That of a user's task may be anything.
         if not isinstance(scenario, Scenario):
             raise ConfigurationError(f"its method scenario must return a servobench.Scenario, got {scenario!r}")
         m, times = len(setting.feature.names), np.linspace(0.0, scenario.duration, POINTS)
@@ -183,6 +185,7 @@ class Experiment:
         return np.stack(arrays) if self.together else arrays[0]
 
 
+@same_folder()
 def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experiment:
     """Make a run ready.
 
@@ -212,6 +215,7 @@ def build(resolved: ResolvedRun, *, progress: Progress | None = None) -> Experim
         raise
 
 
+@same_folder()
 def build_together(runs: Sequence[ResolvedRun]) -> Experiment:
     """Make runs of one `lanes.side_by_side_key` ready, with a lane for each.
 
@@ -237,7 +241,7 @@ def _assemble(
         raise ConfigurationError(f"plant {entry.name} has the sensing position only, got {request.sensing}")
     robot = None if entry.own_robot else find_robot(request.robot)
     setup = PlantSetup(true, start, run.period, robot)
-    with configuration_errors(f"plant {request.plant}: ", RunFault):
+    with same_folder(), configuration_errors(f"plant {request.plant}: ", RunFault):
         plant = entry.build(resolved.plant, setup)
     if not math.isclose(plant.spec.period, run.period):
         plant.close()

@@ -148,7 +148,7 @@ def read_mapping(kind: type[Roles], path: Path) -> Roles:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
     empty: Any = kind(**{key: path if key == "file" else ("to be given",) for key in needed})
     mapping = override(f"mapping {path}", empty, table)
-    log = None if mapping.debug_log is None else path.parent / mapping.debug_log
+    log = None if mapping.debug_log is None else path.parent.absolute() / mapping.debug_log
     made: Roles = replace(mapping, file=path.parent / mapping.file, debug_log=log)
     return made
 
