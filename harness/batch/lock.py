@@ -143,6 +143,11 @@ def _acquire(path: Path) -> tuple[int, Holder | None]:
             if _same(path, descriptor):
                 who = holder or before or "a process that did not write its name"
                 raise ConfigurationError(f"results folder {path.parent} is being written by {who}") from None
+        except OSError as error:
+            raise ConfigurationError(
+                f"results folder {path.parent} lies on a file system without locks ({error.strerror}), as some "
+                "network mounts are; name a local folder and copy it afterwards"
+            ) from error
         finally:
             os.close(descriptor)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch.plan import Survey
-from servobench.harness.config.installation import blas_libraries, git_commit, installed_version, why_unknown_commit
+from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
 from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
@@ -47,6 +47,7 @@ def describe_batch(
         steps: the table of steps is kept, too.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
+    commit, unknown = read_checkout()
     identity = json.dumps([runs.digest, configuration, steps], sort_keys=True, default=str)
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -67,8 +68,8 @@ def describe_batch(
         "blas": blas_libraries(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "git_commit": git_commit(),
-        "git_commit_unknown": why_unknown_commit(),
+        "git_commit": commit,
+        "git_commit_unknown": unknown,
         "side_by_side": dict(side_by_side),
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),

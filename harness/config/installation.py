@@ -95,32 +95,24 @@ class CommitUnknown(Exception):
 
 
 @cache
-def git_commit() -> str | None:
-    """Return the commit of the checkout this code lies in, marked where code differs from it; None if it is unknown."""
-    try:
-        return _read_commit(CHECKOUT)
-    except CommitUnknown:
-        return None
+def read_checkout() -> tuple[str | None, str | None]:
+    """Return the commit of the checkout this code lies in, and why it is unknown; None for what does not apply.
 
-
-@cache
-def why_unknown_commit() -> str | None:
-    """Return why the commit of a checkout is unknown; None where it is known, or where the code lies in none."""
+    The commit is marked where code differs from it.
+    """
     try:
-        _read_commit(CHECKOUT)
+        return _read_commit(CHECKOUT), None
     except CommitUnknown as error:
-        return str(error)
-    return None
+        return None, str(error)
 
 
 def version_line() -> str:
     """Return the line that `servobench --version` prints."""
     line = f"servobench {installed_version() or 'not installed'}"
-    commit = git_commit()
+    commit, reason = read_checkout()
     if commit is not None:
         hash_, dirty, _ = commit.partition("-dirty")
         return f"{line} (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})"
-    reason = why_unknown_commit()
     return line if reason is None else f"{line} (commit unknown: {reason})"
 
 
@@ -132,16 +124,18 @@ def blas_libraries() -> list[dict[str, Any]]:
     import numpy as np  # noqa: PLC0415 - the version is printed without it
     from threadpoolctl import threadpool_info  # noqa: PLC0415 - likewise
 
-    found: list[dict[str, Any]] = []
-    for each in threadpool_info():
-        if each["user_api"] == "blas":
-            names = {"kernel": each.get("architecture"), "file": Path(each["filepath"]).name}
-            found.append(
-                {"name": each["internal_api"], "version": each["version"], "threads": each["num_threads"], **names}
-            )
+    found: list[dict[str, Any]] = [
+        {
+            "name": each["internal_api"],
+            "version": each["version"],
+            "kernel": each.get("architecture"),
+            "threads": each["num_threads"],
+        }
+        for each in threadpool_info()
+        if each["user_api"] == "blas"
+    ]
     if not found:
-        built = np.show_config(mode="dicts")
-        blas = built.get("Build Dependencies", {}).get("blas", {})
+        blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
         found.append({"name": blas.get("name"), "version": blas.get("version"), "threads": None, "kernel": None})
     return found
 

@@ -76,8 +76,7 @@ def test_an_unknown_commit_has_its_reason(spoil, reason, checkout, monkeypatch):
 
 def test_the_version_says_why_the_commit_is_unknown(checkout, monkeypatch):
     monkeypatch.setattr(installation, "CHECKOUT", checkout("own"))
-    monkeypatch.setattr(installation, "git_commit", installation.git_commit.__wrapped__)
-    monkeypatch.setattr(installation, "why_unknown_commit", installation.why_unknown_commit.__wrapped__)
+    monkeypatch.setattr(installation, "read_checkout", installation.read_checkout.__wrapped__)
     monkeypatch.setenv("PATH", "")
     assert version_line().endswith(" (commit unknown: git cannot be run: No such file or directory)")
 

@@ -112,12 +112,14 @@ def test_a_lock_left_by_another_machine_is_free_for_the_system_s_locks_reach_all
         assert lock.stale.host == "elsewhere"
 
 
-def test_a_file_system_without_locks_is_refused_in_one_line(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL])
+def test_a_file_system_without_locks_is_refused_with_the_remedy(number, tmp_path, monkeypatch):
     def refuse(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(ConfigurationError, match="out cannot be written: No locks available"):
+    line = rf"out lies on a file system without locks \({os.strerror(number)}\), .*; name a local folder"
+    with pytest.raises(ConfigurationError, match=line):
         locked(tmp_path / "out").__enter__()
 
 

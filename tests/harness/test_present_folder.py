@@ -45,12 +45,24 @@ def test_a_run_ends_in_the_folder_in_which_it_began(when, tmp_path, monkeypatch)
     assert Path.cwd() == tmp_path
 
 
+ROAM = """
+import os
+from dataclasses import dataclass
+
+from servobench import Task
+from servobench.harness.run.tasks import TASKS
+
+
+@dataclass(frozen=True)
+class Roam(Task):
+    def scenario(self, setting):
+        os.chdir("/")
+        return TASKS["exp1"].default.scenario(setting)
+"""
+
+
 def test_a_task_that_changes_the_folder_leaves_the_names_of_files_as_they_are(tmp_path, monkeypatch):
-    (tmp_path / "roam.py").write_text(
-        "import os\nfrom dataclasses import dataclass\n\nfrom servobench import Task\nfrom servobench.harness.run.tasks import TASKS\n\n\n"
-        "@dataclass(frozen=True)\nclass Roam(Task):\n    def scenario(self, setting):\n        os.chdir('/')\n"
-        "        return TASKS['exp1'].default.scenario(setting)\n"
-    )
+    (tmp_path / "roam.py").write_text(ROAM)
     monkeypatch.chdir(tmp_path)
     assert run("constant", task="./roam.py:Roam").row["status"] == "completed"
     assert Path.cwd() == tmp_path
