@@ -11,16 +11,18 @@ import os
 import re
 import resource
 import signal
+import socket
+import struct
 import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from multiprocessing import parent_process
+from multiprocessing import parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import psutil
 
@@ -32,6 +34,8 @@ FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where non
 FOREIGN_SHARE: Final = 0.8  # share of the memory for all concurrent runs of foreign code
 LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least, on a machine that is no container
 END_TIME, END_PAUSE = 5.0, 0.01  # [s] until all processes below this one have ended, and between two checks
+STAND_PAUSE: Final = 0.05  # [s] between two looks at a child that may be stopped
+OWN_TIME: Final = 1.0  # [s] for a child to end by itself once the parent has ended
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,9 @@ def lead_session() -> None:
 
 
 def begin(modules: Iterable[str], module: str, function: str, *arguments: object) -> None:
-    """Call a function in a new process, which ends with its parent from before its long imports on.
+    """Call a function in a child of this process, which stands over it: a run knows the child only, and may stop it.
+
+    Both end with their parent, from before the long imports on.
 
     Args:
         modules: imported first, if they can be.
@@ -91,11 +97,28 @@ def begin(modules: Iterable[str], module: str, function: str, *arguments: object
         arguments: of the function.
     """
     lead_session()
-    end_with_parent()
+    _prctl(SET_DEATH_SIGNAL, signal.SIGCONT)  # in case that it was stopped
+    adopt_orphans()
+    own = os.getpid()
+    child = os.fork()
+    if child:
+        _stand_over(child)
+    lead_session()
+    end_with_parent(own)
     for name in (*modules, module):
         with contextlib.suppress(Exception):
             import_module(name)
     getattr(sys.modules[module], function)(*arguments)
+
+
+def forget_tracker() -> None:
+    """Close the link to the process that tracks resources for the parent, and start another one where one is needed."""
+    tracker: Any = resource_tracker._resource_tracker
+    if tracker._fd is not None:
+        with contextlib.suppress(OSError):
+            os.close(tracker._fd)
+    tracker._fd = None
+    tracker._pid = None
 
 
 def adopt_orphans() -> None:
@@ -103,17 +126,51 @@ def adopt_orphans() -> None:
     _prctl(ADOPT_ORPHANS, 1)
 
 
-def end_with_parent() -> None:
-    """End this process as soon as its parent ends, which may have ended before this call."""
-    _prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
+def _stand_over(child: int) -> NoReturn:
+    """Continue a child process whenever it is stopped, and end as it does, or when the parent has ended.
+
+    Nothing below this process outlives it.
+    """
+    os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])  # the child's end of its link must be the only one
+    signal.signal(signal.SIGTERM, lambda *_: send([child], signal.SIGTERM))
     parent = parent_process()
-    if parent is None or os.getppid() != parent.pid:
+    deadline = math.inf
+    status = None
+    while status is None and time.monotonic() < deadline:
+        time.sleep(STAND_PAUSE)
+        changed, how = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
+        if changed and os.WIFSTOPPED(how):
+            send([child], signal.SIGCONT)
+        elif changed:
+            status = how
+        if deadline == math.inf and (parent is None or os.getppid() != parent.pid):
+            deadline = time.monotonic() + OWN_TIME
+    end_descendants()
+    if status is None:
+        os._exit(1)
+    code = os.waitstatus_to_exitcode(status)
+    if code < 0:
+        with contextlib.suppress(OSError, ValueError):  # no handler of SIGKILL can be set
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(abs(code))
+
+
+def end_with_parent(parent: int) -> None:
+    """End this process as soon as its parent ends, which may have ended before this call.
+
+    The signal comes with the end of the thread that made this process: the parent has but one.
+    """
+    _prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
+    if os.getppid() != parent:
         os._exit(1)
 
 
-def wake_without_parent() -> None:
-    """Continue this process when its parent ends, in case that it was stopped."""
-    _prctl(SET_DEATH_SIGNAL, signal.SIGCONT)
+def limit_silence(descriptor: int, seconds: int) -> None:
+    """Let a read from an end of a pipe of two directions fail after some seconds without a byte."""
+    pause = struct.pack("ll", seconds, 0)  # a timeval
+    with socket.socket(fileno=os.dup(descriptor)) as end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, pause)
 
 
 def _prctl(option: int, value: int) -> None:
@@ -216,6 +273,17 @@ def wake(child: BaseProcess | None) -> None:
     """Continue a child process in case that a signal has stopped it."""
     if child is not None and child.pid is not None:
         send([child.pid], signal.SIGCONT)
+
+
+def await_end(child: BaseProcess, seconds: float) -> int | None:
+    """Wait for a child process to end, some seconds at most, and return its exit code; None if it goes on.
+
+    `child.join` would trust a pipe to which code of users can write.
+    """
+    deadline = time.monotonic() + seconds
+    while child.exitcode is None and time.monotonic() < deadline:
+        time.sleep(END_PAUSE)
+    return child.exitcode
 
 
 def send(processes: Iterable[int], number: signal.Signals) -> None:

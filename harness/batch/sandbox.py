@@ -47,6 +47,9 @@ STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
 MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
 MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
+MESSAGE_PAUSE: Final = 10  # [s] without a further byte, after which a message of a runner is given up
+SILENT: Final = "the process of the run reported it as done without its answer"
+TALKATIVE: Final = "the process of the run gave more answers than it had runs"
 KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
 GUARD: Final = "servobench guard"  # name of its process
 ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
@@ -62,6 +65,7 @@ class Task:
     argument: bytes
     owner: str = ""  # whose code it runs: different owners never share a runner; "" for this package
     fresh: bool = False  # needs a runner that has carried nothing out before
+    answers: int | None = None  # number of its answers; None for any
 
     def carry_out(self, tell: Tell) -> None:
         """Call the function in this process."""
@@ -209,7 +213,7 @@ class Sandbox:
             process, self._process, self._link = self._process, None, None
             if process is None:
                 return
-            process.join(patience)
+            processes.await_end(process, patience)
             if process.is_alive() and process.pid is not None:
                 processes.send(processes.descendants(process.pid), signal.SIGKILL)
             process.kill()
@@ -266,9 +270,9 @@ class Sandbox:
                 return f"a worker process has not started within {GUARD_START:g} s"
             if link.recv_bytes() == ALIVE:
                 return ""
-        process.join(STOP_TIME)
-        if process.exitcode not in (None, START_ERROR):
-            return f"a worker process was ended while it started{_describe_exit(process.exitcode)}"
+        code = processes.await_end(process, STOP_TIME)
+        if code not in (None, START_ERROR):
+            return f"a worker process was ended while it started{_describe_exit(code)}"
         return (
             "the worker processes cannot be started; a script that starts some must be a file and keep its calls "
             "below `if __name__ == '__main__':`"
@@ -298,7 +302,6 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
         each.close()
     signal.signal(signal.SIGTERM, lambda *_: link.close())  # no exception, which a destructor would swallow
     processes.adopt_orphans()
-    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
     gc.freeze()  # so that runners go on sharing the memory of all imports
     gc.set_threshold(700)  # of Python 3.11; a copy of the command has a larger one, under which memory piles up
     guard = _Guard(link, limits)
@@ -327,7 +330,7 @@ class _Guard:
             below = self._ready(task)
             try:
                 below.send_bytes(pickle.dumps(task))
-                end = self._watch(below)
+                end = self._watch(below, task.answers)
             except (EOFError, OSError):
                 end = self._find_end()
             if end is not None:
@@ -339,34 +342,51 @@ class _Guard:
 
     def _ready(self, task: Task) -> Connection:
         """Return the link to a runner that may carry out a task."""
-        if self._below is not None and task.owner == self._owner and not (task.fresh and self._answers):
+        if self._below is not None and task.owner == self._owner and not task.fresh:
             return self._below
         self.end_runner()
         context = get_context("fork")
         below, theirs = context.Pipe()
+        processes.limit_silence(below.fileno(), MESSAGE_PAUSE)
         self._trace.seek(0)
         self._trace.truncate()
-        arguments = (theirs, (self._link, below), self._limits, self._trace.fileno())
+        arguments = (theirs, (self._link, below), self._limits, self._trace.fileno(), os.getpid())
         runner = context.Process(target=_be_runner, args=arguments)
         runner.start()  # an OSError where the system has no more processes
         theirs.close()
         self._below, self._runner, self._owner, self._answers = below, runner, task.owner, 0
         return below
 
-    def _watch(self, below: Connection) -> End | None:
-        """Pass the answers of the runner on until it is done; return its premature end."""
-        patience, since = max(self._limits.time, START_TIME), time.monotonic()
+    def _watch(self, below: Connection, wanted: int | None) -> End | None:
+        """Pass the answers of the runner on until it is done; return its premature end.
+
+        Code of users can write to the link as well. A task therefore begins once, and ends with as many answers as it
+        was given runs.
+        """
+        patience = max(self._limits.time, START_TIME)
+        since = time.monotonic()
+        begun = False
+        given = 0
         while True:
             ready = wait([below, self._link], LOOK_EVERY)
             if below in ready:
                 message = below.recv_bytes(MAX_ANSWER)
-                if message[:1] == DONE:
+                kind = message[:1]
+                if kind == DONE and given < (wanted or 0):
+                    return self._end(CRASHED, SILENT, certain=False)
+                if kind == DONE:
                     return None
-                if message[:1] not in (ITEM, ALIVE):
+                if kind not in (ITEM, ALIVE) or (kind == ALIVE and begun):
                     return self._find_end()
-                self._answers += message[:1] == ITEM
-                patience, since = self._limits.time, time.monotonic()
+                begun = True
+                patience = self._limits.time
+                since = time.monotonic()
                 self._link.send_bytes(message)
+                if kind == ITEM:
+                    given += 1
+                    self._answers += 1
+                if wanted is not None and given > wanted:
+                    return self._end(CRASHED, TALKATIVE, certain=False)
             elif self._link in ready:  # nobody sends a second task: the other side has ended
                 sys.exit(1)
             elif time.monotonic() - since > patience:
@@ -392,8 +412,8 @@ class _Guard:
 
     def _find_end(self) -> End:
         """Return the end of a runner that is gone, or whose link is."""
-        self._runner.join(TRACE_TIME)
-        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=False)
+        code = processes.await_end(self._runner, TRACE_TIME)
+        return self._end(CRASHED, LOST + _describe_exit(code), certain=False)
 
     def _end(self, status: str, reason: str, *, certain: bool = True) -> End:
         """End the runner and all below it."""
@@ -413,17 +433,18 @@ class _Guard:
         if self._below is not None:
             self._below.close()
             self._runner.kill()
-            self._runner.join(processes.END_TIME)
+            processes.await_end(self._runner, processes.END_TIME)
             self._below = self._runner = None
         processes.end_descendants()
 
 
-def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int) -> None:
+def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits, trace: int, guard: int) -> None:
     """Be a runner: take tasks from the guard until it is gone."""
     processes.lead_session()
-    processes.end_with_parent()
+    processes.end_with_parent(guard)
     for each in inherited:
         each.close()
+    processes.forget_tracker()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, lambda *_: None)  # of somebody else; not ignored, which programs started here inherit
     signal.pthread_sigmask(signal.SIG_SETMASK, set())

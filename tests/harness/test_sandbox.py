@@ -111,36 +111,48 @@ def has_ended(process):
 
 
 KILLED = """
-import os, pickle, signal, time
+import os, pickle, signal, subprocess, sys, time
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits
 from servobench.harness.batch.sandbox import Pool, Task
 
 def hold(seconds, tell):
     tell(None)
+    if {stopper!r}:
+        subprocess.Popen([sys.executable, "-S", "-c", {stopper!r}, str(os.getppid())], start_new_session=True)
     time.sleep(seconds)
 
 if __name__ == "__main__":
     starts = {starts}
     pool = Pool(1, Limits(time=600.0), ["imported"] * starts)
     pool.submit(Task(hold, pickle.dumps(600)))
-    while len(below := processes.descendants(os.getpid())) < 3 - starts:  # resource tracker, guard and runner
+    wanted = 4 - starts + bool({stopper!r})  # resource tracker, guard with the process over it, runner and its child
+    while len(below := processes.descendants(os.getpid())) < wanted:
         time.sleep(0.05)
-    while starts and not os.path.exists("begun"):
+    while wanted != 4 and not os.path.exists("begun"):
         time.sleep(0.05)
     print(*below, flush=True)
     for each in below:
-        if not starts:
+        if wanted == 4:
             os.kill(each, signal.SIGSTOP)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 SLOW = "import time\nopen('begun', 'w').close()\ntime.sleep(600.0)\n"
 
 
+STOPPER = """
+import os, signal, sys, time
+while True:
+    os.kill(int(sys.argv[1]), signal.SIGSTOP)
+    open("begun", "w").close()
+    time.sleep(0.001)
+"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("starts", [False, True])
-def test_what_is_stopped_or_starts_ends_with_the_process_that_started_it(starts, tmp_path):
-    (tmp_path / "killed.py").write_text(KILLED.format(starts=starts))
+@pytest.mark.parametrize(("starts", "stopper"), [(False, ""), (True, ""), (False, STOPPER)])
+def test_what_is_stopped_once_or_for_ever_or_starts_ends_with_the_process_that_started_it(starts, stopper, tmp_path):
+    (tmp_path / "killed.py").write_text(KILLED.format(starts=starts, stopper=stopper))
     (tmp_path / "imported.py").write_text(SLOW)
     done = python("killed.py", path=tmp_path)
     assert done.returncode == -signal.SIGKILL, done.stderr
