@@ -35,13 +35,13 @@ import numpy.typing as npt
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.processes import Bounds, Limits, available_processors, can_watch
-from servobench.harness.batch.sandbox import Answer, End, Pool, Task, Tell, Workers
+from servobench.harness.batch.sandbox import SILENT, TALKATIVE, Answer, End, Pool, Task, Tell, Workers
 from servobench.harness.config import registry
 from servobench.harness.config.source import SourceFile, check_present_folder
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.result import CRASHED, LOST, Ending, RunResult, ends_batch
+from servobench.harness.run.result import COMPLETED, CRASHED, LOST, Ending, RunResult, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import REMARKS, remark
 
@@ -149,7 +149,7 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     except workers.lost:
         answer = Answer([], End(Ending(CRASHED, LOST), certain=False))
     match answer.items:
-        case [{"unreadable": [str(status), str(reason), str(trace)]}]:
+        case [{"unreadable": [str(status), str(reason), str(trace)]}] if status != COMPLETED:
             return [_failed(job, Ending(status, reason, trace)) for job in block.jobs], []
     done, end = list[RunResult](), answer.end
     try:
@@ -157,8 +157,13 @@ def _outcome(block: Block, future: Future[Answer | bytes], workers: Workers) -> 
     except (ValueError, RecursionError) as error:
         reason = f"the answer of the run cannot be read: {error}"
         end = End(Ending(CRASHED, reason), certain=False)
-    if end is None or len(done) == len(block.jobs):
+    if len(answer.items) > len(block.jobs):
+        done.clear()
+        end = End(Ending(CRASHED, TALKATIVE), certain=False)
+    if len(done) == len(block.jobs):
         return done, []
+    if end is None:
+        end = End(Ending(CRASHED, SILENT), certain=False)
     single = replace(block, together=False)
     if not done and len(block.jobs) > 1 and (block.together or workers.lost):
         return [], [single.part(at, at + 1) for at in range(len(block.jobs))]
@@ -185,7 +190,10 @@ def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = Fal
         raise ConfigurationError(
             f"the run {run_id} cannot be sent to another process: {error}; use one worker"
         ) from error
-    return Task(function, packed, block.jobs[0].owner, block.fresh)
+    task = Task(function, packed, block.jobs[0].owner, block.fresh)
+    if function is _carry_out_there:
+        return replace(task, answers=len(block.jobs))
+    return task
 
 
 def build_block(block: Block, submit: Callable[..., Any], progress: Progress) -> None:
@@ -305,7 +313,7 @@ def unpack_result(job: Job, told: object) -> RunResult:
     Raises:
         ValueError: it is not the result of this run.
     """
-    from servobench.harness.batch import tables  # noqa: PLC0415 - pandas and pyarrow, which workers do without
+    from servobench.harness.batch import consistency, tables  # noqa: PLC0415 - pandas, which workers do without
 
     match told:
         case {
@@ -331,7 +339,12 @@ def unpack_result(job: Job, told: object) -> RunResult:
     if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
         raise ValueError("its picture is no image")
     records = _unpack_array(steps)
-    return RunResult(row, None if records is None else tables.steps_of_run(records, row[RUN_ID]), image, trace)
+    table = None if records is None else tables.steps_of_run(records, row[RUN_ID])
+    with configuration_errors("", KeyError, TypeError):
+        wrong = consistency.find_contradiction(row, table, job.run.run.period)
+    if wrong:
+        raise ValueError(wrong)
+    return RunResult(row, table, image, trace)
 
 
 def _pack_array(array: npt.NDArray[Any] | None) -> str | None:

@@ -9,6 +9,7 @@ import time
 import zlib
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
@@ -17,14 +18,14 @@ import pytest
 
 from kit.command import judged
 from kit.nightly import some
-from servobench.harness.batch import blocks, results
+from servobench.harness.batch import blocks, results, sandbox
 from servobench.harness.batch.blocks import Block, Job, carry_out_blocks, cut, even_size, open_workers
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, survey
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Answer, End, Task, Workers
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import identity
+from servobench.harness.run.episode import identity, run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
@@ -251,7 +252,7 @@ def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer
 
     def submit(task):
         block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
-        told = [blocks.pack_result(RunResult.failed(identity(each.run), Ending())) for each in block.jobs]
+        told = [blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision"))) for each in block.jobs]
         sizes.append(len(block.jobs))
         future = Future()
         end = End(Ending("crashed", "SIGTERM"), certain=False) if len(sizes) == 1 else None
@@ -260,7 +261,7 @@ def test_of_a_process_that_is_ended_once_from_outside_the_runs_without_an_answer
 
     outcomes = list(carry_out_blocks([Block(tuple(job(index, None) for index in range(3)))], Workers(submit)))
     assert sorted(result.row["seed"] for _, found in outcomes for result in found) == [0, 1, 2]
-    assert all(result.row["status"] == "completed" for _, found in outcomes for result in found)
+    assert all(result.row["status"] == "collision" for _, found in outcomes for result in found)
     assert sizes == [size for size in (3, answers < 3, 2 - answers) if size > 0]
 
 
@@ -279,7 +280,9 @@ def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
         held.remove(block)
         if died:
             raise ProcessDied
-        return Answer([blocks.pack_result(RunResult.failed(identity(each.run), Ending())) for each in block.jobs])
+        return Answer(
+            [blocks.pack_result(RunResult.failed(identity(each.run), Ending("collision"))) for each in block.jobs]
+        )
 
     def submit(task):
         held.append(blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0])
@@ -289,7 +292,7 @@ def test_runs_that_wait_at_a_worker_of_dask_that_dies_are_not_blamed(kind):
         made = cut([job(index, kind) for index in range(24)], size=12)
         outcomes = list(carry_out_blocks(made, Workers(submit, 1, cluster=True, lost=(ProcessDied,))))
     ends = {result.row["seed"]: result.row["status"] for _, found in outcomes for result in found}
-    assert ends == {index: "crashed" if index in {3, 13} else "completed" for index in range(24)}
+    assert ends == {index: "crashed" if index in {3, 13} else "collision" for index in range(24)}
 
 
 def test_a_block_has_consecutive_runs_of_one_kind():
@@ -356,7 +359,7 @@ def test_a_survey_finds_what_the_runs_are_without_keeping_them():
 
 
 def told(**changes: object) -> dict[str, object]:
-    row = RunResult.failed(identity(job(0, None).run), Ending()).row
+    row = RunResult.failed(identity(job(0, None).run), Ending("collision")).row
     return {"row": row, "steps": None, "picture": None, "trace": ""} | changes
 
 
@@ -393,16 +396,89 @@ def test_an_answer_that_was_falsified_is_refused(answer, why):
         blocks.unpack_result(job(0, None), answer)
 
 
-def test_a_result_is_the_same_after_its_way_through_a_process():
-    numbers = {"step": np.arange(3), "time_s": 0.1 * np.arange(3), "error_norm": [0.1, np.nan, np.inf]}
-    steps = pd.DataFrame({"run_id": "a", **numbers, "valid": [True] * 3})
-    row = RunResult.failed(identity(job(0, None).run), Ending()).row | {"rms_error": np.nan}
-    steps["run_id"] = row["run_id"]
+@pytest.fixture(scope="module")
+def real() -> RunResult:
+    return run_experiment(job(0, None).run.request, Settings({"random": {"duration": 2.0}}))
+
+
+def sent(result: RunResult, row: dict[str, object] | None = None, steps: pd.DataFrame | None = None) -> RunResult:
+    """Return a result as it comes back from a process that changed some of it."""
+    changed = replace(result, row=result.row | (row or {}), steps=result.steps if steps is None else steps)
+    return blocks.unpack_result(job(0, None), json.loads(json.dumps(blocks.pack_result(changed))))
+
+
+def test_a_result_is_the_same_after_its_way_through_a_process(real):
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    packed = json.loads(json.dumps(blocks.pack_result(RunResult(row, steps, picture, "trace"))))
-    back = blocks.unpack_result(job(0, None), packed)
-    pd.testing.assert_frame_equal(back.steps, steps, check_exact=True)
+    back = sent(replace(real, picture=picture, trace="trace"))
+    pd.testing.assert_frame_equal(back.steps, real.steps, check_exact=True)
     np.testing.assert_array_equal(back.picture, picture)
-    assert list(back.row) == list(row)
-    assert back.row | {"rms_error": None} == row | {"rms_error": None}
+    assert list(back.row) == list(real.row)
+    pd.testing.assert_frame_equal(pd.DataFrame([back.row]), pd.DataFrame([real.row]), check_exact=True)
     assert back.trace == "trace"
+    assert sent(replace(real, steps=None)).steps is None
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [
+        ({"outcome": "followed"}, "its outcome 'followed' contradicts its status, settling time or error"),
+        ({"outcome": "settled", "settling_time_s": math.nan}, "its outcome 'settled' contradicts"),
+        ({"outcome": "not_settled", "settling_time_s": 0.1}, "its outcome 'not_settled' contradicts"),
+        ({"outcome": "brilliant"}, "its outcome 'brilliant' contradicts"),
+        ({"outcome": "settled", "settling_time_s": 9.0}, "its settling time 9 s is beyond its 2 s"),
+        ({"outcome": "settled", "settling_time_s": 0.0}, "its steady_state_error is outside the band"),
+        ({"status": "collision"}, "its outcome '[a-z_]+' contradicts its status"),
+        ({"rms_error": 1e3}, "its rms_error is larger than its largest error"),
+        ({"rms_error": 0.0}, "its rms_error is 0, and by its steps"),
+        ({"control_effort_rad": 0.0}, "its control_effort_rad is 0, and by its steps"),
+        ({"controller_time_median_us": 1.0}, "its controller_time_median_us is 1, and by its steps"),
+        ({"periods": 3}, "it has 3 periods and "),
+    ],
+)
+def test_a_row_that_contradicts_itself_or_its_steps_is_refused(real, row, why):
+    assert real.row["outcome"] != "settled"
+    with pytest.raises(ValueError, match=f"^{why}"):
+        sent(real, row)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "why"),
+    [
+        ("error_norm", 0.0, "its error_norm is not that of its steps"),
+        ("time_s", 0.5, "its steps are not a period apart"),
+        ("joint_velocity_command_elbow_rad_s", 0.5, "its control_effort_rad is "),
+    ],
+)
+def test_steps_that_do_not_fit_their_row_are_refused(real, column, factor, why):
+    with pytest.raises(ValueError, match=f"^{why}"):
+        sent(real, steps=real.steps.assign(**{column: factor * real.steps[column]}))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("unreadable", [False, True])
+def test_a_task_that_is_done_with_fewer_answers_than_runs_has_a_row_for_each_run(count, unreadable):
+    forged = [{"unreadable": ["completed", "", ""]}] * unreadable
+
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
+        future = Future()
+        future.set_result(Answer(forged or [told()][: count * (block.jobs[0].index == 0)]))
+        return future
+
+    jobs = tuple(job(index, None) for index in range(3))
+    found = [result for _, part in carry_out_blocks([Block(jobs)], Workers(submit)) for result in part]
+    ends = {result.row["seed"]: result.row["status"] for result in found}
+    assert ends == {0: "collision" if count and not unreadable else "crashed", 1: "crashed", 2: "crashed"}
+    reasons = {result.row["reason"] for result in found if result.row["status"] == "crashed"}
+    assert (sandbox.SILENT in reasons) == (not unreadable)
+
+
+def test_more_answers_than_runs_are_no_answer():
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
+        future = Future()
+        future.set_result(Answer([told(), told()] if block.jobs[0].index == 0 else [told()]))
+        return future
+
+    (found,) = [result for _, part in carry_out_blocks([Block((job(0, None),))], Workers(submit)) for result in part]
+    assert (found.row["status"], found.row["reason"]) == ("crashed", sandbox.TALKATIVE)

@@ -1,0 +1,143 @@
+"""Whether the row of a run fits itself and its steps, as one does that the harness has made.
+
+Code of users shares the process of its run and can write any row. What follows from the steps is computed again here,
+with the functions that made the row; the rest is compared within the row. A log that was falsified while it was written
+has a row that fits it, and is not noticed.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.run.log import Steps
+from servobench.harness.run.metrics import FINAL_SPAN, METRICS, Judged
+from servobench.harness.run.outcome import FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, OUTCOMES, SETTLED
+from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import COMMAND, Channel, PlantSpec
+
+FROM_STEPS: Final = (  # metrics that need neither limits of the plant nor times of the task
+    "settling_time_s", "settling_time_5pct_s", "overshoot", "steady_state_error", "rms_error", "max_error", "log_error",
+    "path_length_ratio", "max_joint_position_rad", "control_effort_rad", "joint_acceleration_peak_rad_s2",
+    "joint_acceleration_rms_rad_s2", "joint_jerk_peak_rad_s3", "joint_jerk_rms_rad_s3", "feature_invalid_fraction",
+    "controller_time_median_us", "controller_time_p99_us", "plant_time_median_us",
+)  # fmt: skip
+MOVE: Final = "point_to_point"
+MOVE_OUTCOMES: Final = frozenset(OUTCOMES) - {FOLLOWED, NOT_FOLLOWED}
+CURVE_OUTCOMES: Final = frozenset(OUTCOMES) - {SETTLED, NOT_SETTLED}
+ERRORS: Final = ("rms_error", "rms_error_evaluated", "rms_error_second_lap", "steady_state_error")
+TOLERANCE: Final = 1e-9  # of a number, by which two sums of the same terms may differ
+ANY: Final = 1e9  # [rad, rad/s] a limit that no metric above reads
+
+
+def find_contradiction(row: Mapping[str, Any], steps: pd.DataFrame | None, period: float) -> str:
+    """Return how the row of a run contradicts itself or its steps, as a clause; empty if it does not.
+
+    Args:
+        row: with values of the right types.
+        steps: its table of steps; None where none is kept.
+        period: of control [s].
+
+    Raises:
+        ValueError: the steps lack columns, or have some that no run has.
+    """
+    if wrong := _find_within(row, period):
+        return wrong
+    if steps is None:
+        return ""
+    return _find_beside(row, steps, period)
+
+
+def _find_within(row: Mapping[str, Any], period: float) -> str:
+    status = row["status"]
+    outcome = row["outcome"]
+    if status != COMPLETED:
+        fits = outcome == status
+    elif row["task_kind"] == MOVE:
+        settled = not math.isnan(_number(row, "settling_time_s"))
+        fits = outcome in MOVE_OUTCOMES and settled == (outcome == SETTLED)
+    else:
+        band = FOLLOWING_BANDS * _number(row, "settling_band")
+        followed = _number(row, "rms_error_evaluated") <= band
+        fits = outcome in CURVE_OUTCOMES and followed == (outcome == FOLLOWED)
+    if not fits:
+        return f"its outcome {outcome!r} contradicts its status, settling time or error"
+    length = row["periods"] * period
+    settling = _number(row, "settling_time_s")
+    if settling > length:
+        return f"its settling time {settling:g} s is beyond its {length:g} s"
+    largest = _number(row, "max_error")
+    for name in ERRORS:
+        if _number(row, name) > largest * (1.0 + TOLERANCE):
+            return f"its {name} is larger than its largest error"
+    band = _number(row, "settling_band")
+    if length - settling - period >= FINAL_SPAN and _number(row, "steady_state_error") > band * (1.0 + TOLERANCE):
+        return "its steady_state_error is outside the band in which it settled"
+    return ""
+
+
+def _number(row: Mapping[str, Any], name: str) -> float:
+    value = row.get(name)
+    if value is None:
+        return math.nan
+    return float(value)
+
+
+def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> str:
+    if len(steps) != row["periods"]:
+        return f"it has {row['periods']} periods and {len(steps)} steps"
+    if steps.empty:
+        return ""
+    logged = _as_logged(steps, _number(row, "settling_band"), period)
+    if not np.allclose(logged.time, period * np.arange(len(steps)), rtol=TOLERANCE):
+        return "its steps are not a period apart"
+    with np.errstate(all="ignore"):
+        judged = Judged(logged, row["task_kind"], 0.0, math.nan)
+        if not np.allclose(judged.error, steps["error_norm"], rtol=TOLERANCE, equal_nan=True):
+            return "its error_norm is not that of its steps"
+        for name in FROM_STEPS:
+            compute = METRICS[name].values
+            if compute is None:
+                continue
+            found = float(compute(judged))
+            told = _number(row, name)
+            if not np.isclose(told, found, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
+                return f"its {name} is {told:g}, and by its steps {found:g}"
+    return ""
+
+
+def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
+    """Return a table of steps as the log that it was made of, without Jacobians."""
+
+    def columns(kind: str) -> tuple[str, ...]:
+        return tuple(name for name in steps.columns if name.startswith(f"{kind}_"))
+
+    def numbers(*names: str) -> FloatArray:
+        return steps[list(names)].to_numpy(np.float64)
+
+    places = columns("reference")
+    joints = columns(COMMAND)
+    unlimited = np.full(len(places), np.inf)
+    limit = np.full(len(joints), ANY)
+    feature = Channel(places, "", 1.0, -unlimited, unlimited, band)
+    spec = PlantSpec(feature, Channel(joints, "", 1.0, -limit, limit), -limit, limit, period)
+    true_feature = numbers(*columns("true_feature"))
+    unknown = np.full((len(steps), spec.m, spec.n), np.nan)
+    return Steps(
+        spec,
+        time=numbers("time_s")[:, 0],
+        reference=numbers(*places),
+        feature=true_feature,
+        true_feature=true_feature,
+        joint_position=numbers(*columns("joint_position")),
+        command=numbers(*joints),
+        feature_valid=steps["feature_valid"].to_numpy(np.bool_),
+        estimated_jacobian=unknown,
+        true_jacobian=unknown,
+        controller_time=numbers("controller_time_us")[:, 0],
+        plant_time=numbers("plant_time_us")[:, 0],
+        diagnostics={},
+    )
