@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import progress
 from rich.console import Console
 from rich.text import Text
@@ -111,12 +112,14 @@ class ConsoleObserver(Observer):
     Attributes:
         done: finished runs.
         total: all runs.
+        count: finished runs of all batches so far, and the number of all of their runs.
     """
 
     def __init__(self, console: Console, *, bar: bool = True) -> None:
         self._console, self._shows_bar, self._shown = console, bar, contextlib.ExitStack()
         self._tell = self._shown.enter_context(telling(console, "checking the configuration"))
         self.done = self.total = 0
+        self.count = np.zeros(2, dtype=np.intp)
 
     def training(self, share: float, subject: str) -> None:
         """Show how much of a training of networks is done."""
@@ -126,6 +129,7 @@ class ConsoleObserver(Observer):
         """Show the bar."""
         self.close()
         self.done, self.total = done, total
+        self.count += (done, total)
         self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
         self._bar = self._bars.begin("running", total, done)
         if done == total:
@@ -134,6 +138,7 @@ class ConsoleObserver(Observer):
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
         self.done += len(rows)
+        self.count[0] += len(rows)
         self._bars.reach(self._bar, self.done, f"{self.done} of {self.total} runs")
         if self.done == self.total:
             self.close()
@@ -149,7 +154,7 @@ class ConsoleObserver(Observer):
 
 @contextlib.contextmanager
 def watching(console: Console, folder: Path, how: Execution) -> Iterator[Execution]:
-    """Yield how runs are carried out, with their progress shown; after Ctrl-C a line says how to go on.
+    """Yield how runs are carried out, with their progress shown; a line says how many there are, or how to go on.
 
     Args:
         console: where it shows the progress.
@@ -159,6 +164,9 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
     observer = ConsoleObserver(console, bar=not how.debug)
     try:
         yield replace(how, observer=observer)
+        finished, wanted = observer.count
+        if wanted > 1:
+            observer.note(f"{finished} of {wanted} runs are there")
     except KeyboardInterrupt:
         observer.close()
         if not any(folder.rglob("*.parquet")):

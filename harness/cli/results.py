@@ -145,6 +145,7 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     results.check_folder(folder)
     with locked(folder):
         count = results.collect(folder)
+    say(results.describe_missing(folder))
     say(f"{count} runs in {folder / results.RUNS}")
 
 
@@ -202,20 +203,23 @@ def print_faults(folder: Path, runs: pd.DataFrame) -> None:
         say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def judge(folder: Path, *, strict: bool) -> None:
-    """Say how many runs of a finished batch failed and where their traces are; end with exit code 1 if that counts.
+def judge(folder: Path, *, strict: bool, whole: bool = True) -> None:
+    """Say how many runs of a batch lack or failed and where their traces are; end with exit code 1 if that counts.
 
     Args:
         folder: its results.
-        strict: whether a run that failed makes the command fail.
+        strict: whether a run that failed or lacks makes the command fail.
+        whole: whether the command was to carry out all runs of the batch.
     """
     from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
 
     completed = [table["status"] == COMPLETED for table in results.iterate_runs(folder, ("status",))]
     count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
-    if not failed:
-        return
-    say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}")
-    if strict:
+    lack = results.missing_line(count, results.read_manifest(folder).get("run_count", 0))
+    if whole:
+        say(lack)
+    if failed:
+        say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why: {folder / results.FAILURES}")
+    if strict and (failed or (whole and lack)):
         sys.exit(FAILED)

@@ -192,4 +192,4 @@ def _carry_out(
             except (ConfigurationError, ImportError) as error:  # the runs are safe, and the report can be made again
                 missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
                 say(f"no report: {missing or error}")
-    judge(folder, strict=strict)
+    judge(folder, strict=strict, whole=how.part == (1, 1))

@@ -60,14 +60,15 @@ def sweep(
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
     campaign = Campaign(SweepPlan.parse(combinations.batch(), variations).cells(), overrides.settings())
-    with watching(console, out, running.execution()) as how:
+    execution = running.execution()
+    with watching(console, out, execution) as how:
         carry_out(campaign, out, how)
     columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
     legend = f"{outcome_legend(results.iterate_runs(out, columns))}\n{MISSING} as configured".lstrip()
     print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
     say(describe_controllers(out))
     say(f"table in {out / results.RUNS}")
-    judge(out, strict=running.strict)
+    judge(out, strict=running.strict, whole=execution.part == (1, 1))
 
 
 def robustness(
