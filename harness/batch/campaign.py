@@ -37,7 +37,7 @@ from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
 from servobench.harness.batch.processes import Bounds
 from servobench.harness.batch.sandbox import Workers
-from servobench.harness.batch.tables import writing
+from servobench.harness.batch.tables import refuse_nameless, writing
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Settings, flatten
 from servobench.harness.run.experiment import build_once
@@ -258,8 +258,9 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
         ConfigurationError: a folder without parts, of another batch or with a damaged file, or a run that two have.
     """
     manifest, found = results.read_manifest(folders[0]), list[tuple[range, Path]]()
+    tables = []
     for folder in folders:
-        results.load_runs(folder)  # refuses a table of anything else, whose names are of files
+        tables.append(results.load_runs(folder))  # refuses a table of anything else, whose names are of files
         check_same_batch(folder, manifest, note, remedy="leave it away")
         if not (parts := results.finished_runs(folder)):
             raise ConfigurationError(f"{folder} holds a whole batch, no part; join tables of several with pandas")
@@ -268,6 +269,7 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
     for (runs, folder), (others, other) in pairwise(found):
         if others.start < runs.stop:
             raise ConfigurationError(f"{folder} and {other} have the same runs: leave one away")
+    refuse_nameless(out, pd.concat(tables, ignore_index=True))
     with locked(out):
         results.create_folder(out, manifest)
         results.copy_parts(((folder, runs.start) for runs, folder in found), out)

@@ -29,7 +29,7 @@ MOVE: Final = "point_to_point"
 MOVE_OUTCOMES: Final = frozenset(OUTCOMES) - {FOLLOWED, NOT_FOLLOWED}
 CURVE_OUTCOMES: Final = frozenset(OUTCOMES) - {SETTLED, NOT_SETTLED}
 ERRORS: Final = ("rms_error", "rms_error_evaluated", "rms_error_second_lap", "steady_state_error")
-TOLERANCE: Final = 1e-9  # of a number, by which two sums of the same terms may differ
+TOLERANCE: Final = 1e-9  # [1] by which two sums of the same terms may differ
 ANY: Final = 1e9  # [rad, rad/s] a limit that no metric above reads
 
 

@@ -346,7 +346,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
     for request in requests:
         run_id = request.run_id
         digest.update(f"{run_id}\n".encode())
-        names.append(hash(run_id))
+        names.append(hash(run_id.casefold()))
         seeds.append(request.seed)
         condition = (request.mismatch, request.varied, request.robot, request.sensing)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
@@ -368,12 +368,13 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
 
 
 def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> None:
-    """Refuse runs of the same name; only where two of the hashes are equal the names are looked at."""
-    values, counts = np.unique(np.frombuffer(hashes, dtype=np.int64), return_counts=True)
-    if suspects := set(values[counts > 1].tolist()):
-        names = Counter(request.run_id for request in requests if hash(request.run_id) in suspects)
+    """Refuse runs whose names differ in capitals at most; where two of the hashes are equal the names are looked at."""
+    different = np.unique(np.frombuffer(hashes, dtype=np.int64))
+    if len(different) < len(hashes):
+        names = Counter(request.run_id.casefold() for request in requests)
         name, count = names.most_common(1)[0]
         if count > 1:
+            name = next(request.run_id for request in requests if request.run_id.casefold() == name)
             raise ConfigurationError(f"the run {name} is asked for twice: leave one out, or rename a file (NAME=FILE)")
 
 

@@ -224,6 +224,10 @@ TEXTS: Final = frozenset(
 WHOLE: Final = frozenset(("seed", "periods"))
 NUMBERS: Final = frozenset({"settling_band", *WHOLE, *METRICS, *(short.column for short in SHORT_NAMES.values())})
 MOST: Final = {name: 1.0 if name.endswith("_fraction") else math.inf for name in NUMBERS}  # and 0 is the least
+OWN_STEMS: Final = frozenset(  # names of files and folders that a results folder, or its export, has itself
+    ("runs", "steps", "manifest", "failures", "sha256sums", "parts", "pictures", "networks", "figures", "recordings",
+     "report", "latest")
+)  # fmt: skip
 RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
 
@@ -286,7 +290,7 @@ def refuse_lacking(path: Path, kind: str, schema: pa.Schema) -> None:
 
 
 def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
-    """Refuse a table of runs in which a run is not identified, or not fit for the name of a file, or no number can be.
+    """Refuse a table of runs with a number that cannot be, or a run whose identifier cannot name a file of its own.
 
     Raises:
         ConfigurationError: names the table, the column and the row.
@@ -300,9 +304,21 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     for name in [each for each in MOST if each in least]:
         if least[name] < 0.0 or most[name] > MOST[name]:
             raise ConfigurationError(f"{path} is no table of runs: {name} is {min(least[name], 0.0) or most[name]:g}")
+    taken: dict[str, int] = {}
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
             raise ConfigurationError(
                 f"{path} is no table of runs: the run_id of row {row}, {str(run_id)[:60]!r}, is unfit for the name of "
                 "a file; it has letters, digits and . = + _ - only, and does not begin with a dot"
+            )
+        name = run_id.casefold()
+        if name.partition(".")[0] in OWN_STEMS:
+            raise ConfigurationError(
+                f"{path} is no table of runs: the run_id of row {row}, {run_id!r}, is a name of its folder"
+            )
+        before = taken.setdefault(name, row)
+        if before != row:
+            raise ConfigurationError(
+                f"{path} is no table of runs: rows {before} and {row} have the run_id {run_id!r}, in which capitals do "
+                "not count; restore the table from a copy"
             )

@@ -16,8 +16,9 @@ from servobench.plant.contract.faults import ConfigurationError, configuration_e
 if TYPE_CHECKING:
     from servobench.plant.contract.checks import FloatArray
 
-FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
-CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+# The begin of a formula that a spreadsheet runs: in a cell, or behind a mark that some countries put between cells.
+FORMULA: Final = re.compile("^(?=[=+\\-@\t\uff1d\uff0b\uff0d\uff20])|(?<=[;\t])(?=[=+\\-@\uff1d\uff0b\uff0d\uff20])")
+CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -63,10 +64,16 @@ def accessing(path: Path | None, kind: str = "", done: str = "written") -> Itera
 
 
 def write_csv(table: Any, path: Path) -> None:  # noqa: ANN401 - pandas need not be imported here
-    """Write a DataFrame as CSV, atomically; a text that a spreadsheet would run as a formula gets an apostrophe."""
+    """Write a DataFrame as CSV, atomically.
+
+    A text that a spreadsheet would run as a formula gets an apostrophe; signs that some readers take for the end of a
+    row are written by their number.
+    """
 
     def quoted(cell: Any) -> Any:  # noqa: ANN401 - a cell of any kind
-        return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell
+        if not isinstance(cell, str):
+            return cell
+        return FORMULA.sub("'", harmless(cell))
 
     texts = {str(name): column.map(quoted) for name, column in table.items() if column.dtype.kind not in "biufM"}
     safe = table.assign(**texts).rename(columns=quoted)

@@ -356,6 +356,9 @@ def test_a_survey_finds_what_the_runs_are_without_keeping_them():
     assert found.digest == survey(list(batch.requests())).digest != survey(batch.requests()[::-1]).digest
     with pytest.raises(ConfigurationError, match="the run kinematic-constant-random-none-3 is asked for twice"):
         survey([*batch.requests(), batch.requests()[0]])
+    upper = [RunRequest("kinematic", name, "random", "none", 3) for name in ("mine", "Mine")]
+    with pytest.raises(ConfigurationError, match="the run kinematic-mine-random-none-3 is asked for twice"):
+        survey(upper)
 
 
 def told(**changes: object) -> dict[str, object]:

@@ -1,5 +1,7 @@
 """Whatever a stranger's results folder holds, commands write only where the user said, and run nothing in it."""
 
+import csv
+import io
 import os
 import re
 import sys
@@ -25,6 +27,7 @@ from servobench.plant.contract.checksums import SUMS, write_vouched
 
 RUN = "kinematic-constant-exp1-moderate-0"
 TEXTS = ("plant", "task", "mismatch", "robot", "sensing", "engine", "task_kind", "feature_unit", "outcome", "reason")
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet runs
 PAYLOADS = ("../../escaped", "/ELSEWHERE/escaped", "=cmd|'/C calc'!A1", "$(touch escaped)", "<b>", "x\n## y", "%s{0}")
 
 
@@ -124,6 +127,22 @@ def test_no_command_writes_outside_of_a_hostile_folder_or_runs_it(kind, tmp_path
     assert not list(tmp_path.rglob("escaped*"))
 
 
+@pytest.mark.parametrize("command", ["verify {}", "export {} --out {}/../csv", "merge {} --out {}/../m", "collect {}"])
+def test_a_run_that_is_called_as_the_table_of_runs_is_refused_by_every_command(refusal_of, tmp_path, command):
+    folder = signed(tmp_path / "folder", run_id="runs")
+    assert "'runs', is a name of its folder" in refusal_of(*command.format(folder, folder).split())
+    assert [each.name for each in tmp_path.iterdir()] == ["folder"]
+
+
+def test_parts_with_the_same_run_are_not_merged(refusal_of, tmp_path):
+    one = signed(tmp_path / "one")
+    results.create_folder(tmp_path / "two", MANIFEST | {"run_count": 2})
+    results.write_part(tmp_path / "two", 1, [RunResult(row() | {"run_id": RUN.upper()}, None)])
+    line = refusal_of("merge", one, tmp_path / "two", "--out", tmp_path / "out")
+    assert "rows 0 and 1 have the run_id" in line
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_picture_is_merged_to_a_place_that_a_run_names(refusal_of, tmp_path):
     (signed(tmp_path / "home" / "folder", run_id="../../picture") / "pictures").mkdir()
     (tmp_path / "home" / "picture.png").write_text("somebody's")
@@ -139,8 +158,24 @@ def test_a_spreadsheet_runs_no_cell_of_an_export(tmp_path, monkeypatch):
     runs = pd.read_csv(tmp_path / "csv" / "runs.csv")
     assert runs.loc[0, "controller"] == "'=cmd|'/C calc'!A1"
     assert runs.loc[0, "'=1+1"] == "'@x"
-    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(files.FORMULA)).any(axis=None)
+    assert not runs.map(lambda cell: isinstance(cell, str) and cell.startswith(FORMULA)).any(axis=None)
     assert runs.loc[0, "seed"] == 0
+
+
+@pytest.mark.parametrize(
+    "end", ["\r", "\r\n", "\n", "\x0b", "\x0c", "\x1c", "\x85", "\u2028", "\u2029", ";", "\t", "\x00\r"]
+)
+def test_no_text_of_an_export_begins_a_row_or_a_formula(end, tmp_path):
+    table = pd.DataFrame({"reason": [f'a{end}=HYPERLINK("http://x","y")', "plain, text"], "seed": [1, 2]})
+    files.write_csv(table, tmp_path / "runs.csv")
+    text = (tmp_path / "runs.csv").read_bytes().decode()
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    assert [len(each) for each in rows] == [2, 2, 2]
+    assert rows[2] == ["plain, text", "2"]
+    lines = text.splitlines()
+    assert len(lines) == 3 + end.endswith("\n")  # within quotes
+    for mark in ";\t":
+        assert not any(cell.startswith(FORMULA) for line in rows for cell in ",".join(line).split(mark))
 
 
 BOMB = pa.table(dict.fromkeys(map("x{}".format, range(30)), pa.nulls(10**6, pa.float64())))
@@ -153,7 +188,13 @@ WRONG = {
     "a share above 1": (lambda runs: runs.assign(saturation_fraction=2.0), "saturation_fraction is 2"),
     "truths for numbers": (lambda runs: runs.assign(rms_error=True), "has bool in the column rms_error, where numbers"),
     "half seeds": (lambda runs: runs.assign(seed=0.5), "has double in the column seed, where whole numbers belong"),
-    "a run twice": (lambda runs: pd.concat([runs, runs, runs.assign(controller="b")]), "constant has several runs of"),
+    "a run twice": (lambda runs: pd.concat([runs, runs, runs.assign(controller="b")]),
+        "rows 0 and 1 have the run_id"),
+    "runs whose names differ in capitals": (lambda runs: pd.concat([runs, runs.assign(run_id=RUN.upper(), seed=1)]),
+        "rows 0 and 1 have the run_id"),
+    "a run called runs": (lambda runs: runs.assign(run_id="Runs"), "'Runs', is a name of its folder"),
+    "a run called as the checksums": (lambda runs: runs.assign(run_id=SUMS), "'SHA256SUMS', is a name of its folder"),
+    "a run called as a part": (lambda runs: runs.assign(run_id="steps.parquet"), "is a name of its folder"),
     "names of two lines": (lambda runs: runs.assign(**{"a\nb": 1}), "a name that cannot be printed"),
     "too many columns": (lambda runs: runs.assign(**{f"x{i}": 0 for i in range(51)}), "a table has at most 50"),
     "a bomb": (lambda runs: BOMB.to_pandas(), r"is a bomb: it unpacks to 3e\+07 cells"),
