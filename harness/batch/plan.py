@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import tomllib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,6 +23,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
+from servobench.plant.contract.files import parse_toml
 from servobench.plant.contract.settings import listed
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
@@ -276,7 +276,7 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
         values = [f"{each:g}{span[2]}" for each in values] if span[2] else values
     else:
         try:
-            values = tomllib.loads(f"values = [{text}]")["values"]
+            values = parse_toml(f"values = [{text}]")["values"]
         except (ValueError, RecursionError):
             words = [part.strip() for part in text.split(",")]
             parts = [split_quantity(word) for word in words]

@@ -11,7 +11,6 @@ has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.files import parse_toml, read_toml
 from servobench.plant.contract.settings import override
 
 Config = TypeVar("Config")
@@ -132,7 +131,7 @@ def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
     bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""  # three numbers or more, without brackets
     try:
-        value = tomllib.loads(f"value = [{text}]" if bare else f"value = {text}")["value"]
+        value = parse_toml(f"value = [{text}]" if bare else f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text.strip()  # a bare word is a string
     target = sections
@@ -197,7 +196,7 @@ def tuned_settings(name: str) -> Mapping[str, Any]:
     if not file.is_file():
         return {}
     try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))["settings"]
+        values = parse_toml(file.read_text(encoding="utf-8"))["settings"]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigurationError(f"tuned values {file} cannot be read: {error}; make them with tune") from error
     if not isinstance(values, dict):

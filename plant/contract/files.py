@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 # The begin of a formula that a spreadsheet runs: in a cell, or behind a mark that some countries put between cells.
 FORMULA: Final = re.compile("^(?=[=+\\-@\t\uff1d\uff0b\uff0d\uff20])|(?<=[;\t])(?=[=+\\-@\uff1d\uff0b\uff0d\uff20])")
 CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+TOML_TEXT: Final = re.compile(  # a text of any of four kinds, or a comment
+    r'''"""(?:[^"\\]++|\\.|""?+(?!"))*+"{3,5}|\'{3}.*?\'{3,5}|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*'|#[^\n]*''', re.DOTALL
+)
+MAX_KEY_PARTS: Final = 32
+TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
+MAX_TOML: Final = 500_000  # [letters] beside texts and comments
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -90,11 +96,27 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: it cannot be read, or is not valid TOML.
     """
-    import tomllib  # noqa: PLC0415 - help pages are printed without it
-
     text = read_text(kind, path)
     with configuration_errors(f"{kind} {path} is not valid TOML: ", RecursionError):
-        return tomllib.loads(text)
+        return parse_toml(text)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the content of a text in TOML.
+
+    Time and memory of the parser grow with the square of the parts of a key, and each part has tables of its own.
+
+    Raises:
+        ValueError: it is not valid, or of keys with too many parts, or of too many.
+    """
+    import tomllib  # noqa: PLC0415 - help pages are printed without it
+
+    bare = TOML_TEXT.sub('"', text)
+    if long := TOML_LONG_KEY.search(bare):
+        raise ValueError(f"the key {long[0][:20]}… has more than {MAX_KEY_PARTS} parts; nest no deeper")
+    if len(bare) > MAX_TOML:
+        raise ValueError(f"it has {len(bare)} letters beside texts and comments; at most {MAX_TOML} are read")
+    return tomllib.loads(text)
 
 
 def read_text(kind: str, path: Path) -> str:
