@@ -101,7 +101,7 @@ def validate_fmu(path: Path) -> Validation:
             deviation = _deviation(description)
         else:
             with closing(open_instance(description)) as instance:
-                instance.start(0.0)
+                instance.start(description.start_time)
     except (FmuError, ValueError) as error:
         problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
     if deviation is not None and not deviation <= TOLERANCE:

@@ -29,7 +29,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import NUMERIC, FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_roles, check_unit, read_mapping
+from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_roles, check_unit, first_instant, read_mapping
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -62,6 +62,8 @@ class ControllerMapping:
     """Outputs with the estimated Jacobian, row-major (m, n), for the log."""
     parameters: Mapping[str, Values] = nested(dict)
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
+    start_time: float | None = None
+    """[s] of the FMU's clock at the start of a run; None for that of its default experiment, or else 0."""
     tolerance: Positive | None = None
     """[1] relative one of the FMU's own solver; None for the solver's own."""
     debug_log: File | None = None
@@ -91,6 +93,7 @@ class FmuController(Controller):
         self._outputs = Port(self._description.select((*mapping.outputs, *mapping.jacobian), "outputs", NUMERIC))
         self._write, self._read = self._instance.writer(self._inputs), self._instance.reader(self._outputs)
         self._advance = self._instance.stepper(self._period)
+        self._first = first_instant(mapping.start_time, self._description, self._period)
         self._fresh = True
 
     def _check(self, mapping: ControllerMapping, preview: int, feature_unit: str) -> int:
@@ -137,7 +140,7 @@ class FmuController(Controller):
         self._fresh = False
         for act in self._setters:
             act(self._instance, 0)
-        self._instance.start(time)
+        self._instance.start(self._first + time)
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """Return the output of the FMU for this instant.
@@ -149,7 +152,7 @@ class FmuController(Controller):
         given = [np.ravel(part) for part, wanted in zip(parts, self._given, strict=True) if wanted]
         self._inputs.values[:] = np.concatenate(given)
         self._write()
-        self._advance(observation.time)
+        self._advance(self._first + observation.time)
         self._read()
         velocity = self._outputs.values[: self._shape[1]].copy()
         if not np.isfinite(velocity).all():

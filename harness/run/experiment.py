@@ -29,6 +29,7 @@ from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.scenario import Scenario, TaskSetting, Vector
 from servobench.harness.run.tasks import TASKS, find_task, task_names
+from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -272,8 +273,10 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     """
     try:
         experiment = build(run, progress=progress)
-        experiment.plant.close()
-        _check_features(run, experiment)
+        with contextlib.closing(experiment.plant) as plant:
+            _check_features(run, experiment)
+            if isinstance(plant, Bench):
+                plant.world.rehearse()
     except BaseException as error:
         if isinstance(error, ConfigurationError) or ends_batch(error):
             raise

@@ -281,6 +281,13 @@ class World(Abilities):
         """Return which features of the last measurement are valid, (..., m); None for all of them."""
         return None
 
+    def rehearse(self) -> None:
+        """Remark on what is unlikely at the start of a run; the world has just been built and is closed afterwards.
+
+        Raises:
+            RunFault: a step failed.
+        """
+
     def why_unseen(self) -> str:
         """Return why `see` found nothing, with evidence, for an error message."""
         return "the feature is not visible at the start"

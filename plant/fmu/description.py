@@ -68,6 +68,7 @@ class FmuDescription:
     n_indicators: int = 0  # number of event indicators
     internal_step: float | None = None  # its own fixed step size, s, of which steps must be multiples; None for none
     usual_step: float | None = None  # that of its default experiment, s; None for none
+    start_time: float = 0.0  # that of its default experiment, s; NaN for one that is no number
 
     @cached_property
     def _by_name(self) -> dict[str, Variable]:
@@ -170,17 +171,34 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         n_indicators=int(description.numberOfEventIndicators or 0),
         internal_step=_step(root, "CoSimulation", "fixedInternalStepSize"),
         usual_step=_step(root, "DefaultExperiment", "stepSize"),
+        start_time=read_time(root, "DefaultExperiment", "startTime", 0.0),
     )
 
 
 def _step(root: Path, tag: str, name: str) -> float | None:
-    """Return a step size of the description, s; fmpy does not read all of them."""
-    element = ET.parse(root / DESCRIPTION).getroot().find(tag)
-    try:
-        step = float("nan" if element is None else element.get(name, "nan"))
-    except ValueError:
-        return None
+    step = read_time(root, tag, name, math.nan)
     return step if 0.0 < step < math.inf else None
+
+
+def read_time(root: Path, tag: str, name: str, default: float) -> float:
+    """Return a time of the description, s; fmpy does not read all of them.
+
+    Args:
+        root: folder with the description.
+        tag: element below its root.
+        name: attribute of this element.
+        default: for an attribute that is not there.
+
+    Returns:
+        NaN for an attribute that is no number.
+    """
+    element = ET.parse(root / DESCRIPTION).getroot().find(tag)
+    if element is None or name not in element.attrib:
+        return default
+    try:
+        return float(element.attrib[name])
+    except ValueError:
+        return math.nan
 
 
 def read_exchange(path: Path, root: Path) -> None:

@@ -19,7 +19,18 @@ from annotated_types import MinLen
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import read_toml
-from servobench.plant.contract.settings import File, Names, Numbers, Positive, Usual, Values, nested, override, settings
+from servobench.plant.contract.settings import (
+    File,
+    Names,
+    Numbers,
+    Positive,
+    Usual,
+    Values,
+    nested,
+    override,
+    remark,
+    settings,
+)
 from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.contract.units import SPELLINGS, UNITS
 from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, total_size
@@ -32,6 +43,7 @@ DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit no
 }  # fmt: skip
 REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}  # outputs that may be named more than once, such as one flag
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
+MAX_STEP_ERROR: Final = 1e-3  # relative error of a step from one instant of an FMU's clock to the next
 
 
 @settings
@@ -114,6 +126,8 @@ class FmuMapping:
     """Nominal values of parameters, for controllers; needs directional derivatives. None: there is no nominal model."""
     period: Annotated[Positive, Usual(1.0)] | None = None
     """[s] the FMU's step; None for the control period."""
+    start_time: float | None = None
+    """[s] of the FMU's clock at the start of a run; None for that of its default experiment, or else 0."""
     tolerance: Positive | None = None
     """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for the solver's own."""
     debug_log: File | None = None
@@ -244,6 +258,32 @@ def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float
         f"{description.path.name} is meant to take steps of {usual:g} s and takes those of the control period, "
         f"{period:g} s; period = {usual:g} in the mapping changes that"
     )
+
+
+def first_instant(given: float | None, description: FmuDescription, step: float) -> float:
+    """Return the time of an FMU's clock at which a run begins, s, with a remark on one that the user has not given.
+
+    Args:
+        given: the user's, s; None for that of the FMU's default experiment.
+        description: of the FMU.
+        step: of the FMU, s.
+
+    Raises:
+        ValueError: no number, or one so large that steps are lost in it.
+    """
+    file = description.path.name
+    time = description.start_time
+    source = "startTime of its default experiment"
+    if given is not None:
+        time = given
+        source = "start_time of the mapping"
+    error = abs(time + step - time - step)
+    if not error <= MAX_STEP_ERROR * step:
+        found = f"{file} cannot take steps of {step:g} s from {time:g} s, the {source}"
+        raise ValueError(f"{found}: write start_time = 0.0 into the mapping")
+    if time and given is None:
+        remark(f"{file} begins at {time:g} s, the {source}; start_time in the mapping changes that")
+    return time
 
 
 def _labels(kind: str, names: Names | None, count: int) -> Names:

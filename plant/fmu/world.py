@@ -22,18 +22,21 @@ from servobench.plant.contract.checks import FloatArray, as_array, is_finite, wh
 from servobench.plant.contract.faults import FmuError, configuration_errors
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Delay, Names, nested, settings
+from servobench.plant.contract.settings import Delay, Names, nested, remark, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
-from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
+from servobench.plant.fmu.mapping import FmuMapping, first_instant, mapping_spec, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import build_model
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
+REHEARSED_STEPS: Final = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
+MIN_JUMP: Final = 1e-6  # [unit of the output]
+MAX_JUMP_RATIO: Final = 5.0  # [1] A change is a jump if it is so many times larger than those after it.
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
 INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
@@ -101,8 +104,10 @@ class FmuWorld(World):
         if model is None and (remark := unusual_step(mapping, description, period)):
             logger.warning(remark)
         self.spec = mapping_spec(mapping, description, period)
+        self._begin = first_instant(mapping.start_time, description, self._own_step)
         if model is not None:
             self.spec, self.noise_unit = replace(self.spec, feature=model.channel), model.noise_unit
+        self._is_foreign = model is None
         self._has_start = start is not None
         start = np.zeros(self.spec.n) if start is None else start
         self.lead = np.shape(start)[:-1]
@@ -161,12 +166,12 @@ class FmuWorld(World):
         return self._joints
 
     def _initialise(self) -> None:
-        """Set the parameters of fresh instances and begin at time 0."""
+        """Set the parameters of fresh instances and begin at the first instant."""
 
         def begin(lane: Lane) -> None:
             for act in self._setters:
                 act(lane.instance, lane.row)
-            lane.instance.start(0.0)
+            lane.instance.start(self._begin)
 
         self._instances.each(begin)
         self._k = 0
@@ -188,7 +193,7 @@ class FmuWorld(World):
         self._command.values[self._rows] = joint_velocity
         instances.check("writing", self._command, [lane.write() for lane in instances.live])
         for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
-            time = self._now.value = i * self._own_step
+            time = self._now.value = self._begin + i * self._own_step
             instances.finish([lane.step() for lane in instances.live], time, self._own_step)
         self._k += 1
         if not self._has_joints:
@@ -224,6 +229,33 @@ class FmuWorld(World):
     def visible(self) -> BoolArray | None:
         """Return which features are valid by the FMU; see `World.visible`."""
         return self._seen
+
+    def rehearse(self) -> None:
+        """Remark on joints and features that jump from exactly 0 while the arm rests; see `World.rehearse`.
+
+        An FMU that computes its outputs in steps only has no values of them at the start, but returns zeros.
+        """
+        count = self._split + self.spec.m
+        zero = self._result.values[..., :count] == 0.0
+        if self._seen is not None:
+            zero[..., self._split :] &= self._seen
+        if self.lead or not self._is_foreign or not zero.any():
+            return
+        rows = [self._result.values[:count].copy()]
+        for _ in range(REHEARSED_STEPS):
+            self.advance(np.zeros(self.spec.n))
+            rows.append(self._result.values[:count].copy())
+        changes = np.abs(np.diff(rows, axis=0))
+        jumps = list[str]()
+        for i in np.flatnonzero(zero).tolist():
+            first = int(np.argmax(changes[:, i] > MIN_JUMP))
+            later = changes[first + 1 :, i].max(initial=0.0)
+            if changes[first, i] > max(MIN_JUMP, MAX_JUMP_RATIO * later):
+                jumps.append(f"{self._result.labels[i]} (to {rows[first + 1][i]:.3g} in step {first + 1})")
+        if jumps:
+            found = f"{self.description.path.name} returns 0 at the start for what then jumps though the arm rests"
+            remedy = "let it compute its outputs in the initialisation, too, or map `seen`"
+            remark(f"{found}: {', '.join(jumps)}; runs begin with a wrong measurement: {remedy}")
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """Set the parameters of the camera's pose; see `Plant.move_camera`.

@@ -1,0 +1,114 @@
+"""Habits and faults of foreign FMUs: clocks, late outputs, odd archives, lacking functions, bad ends."""
+
+import numpy as np
+import pytest
+
+from kit.command import servobench
+from kit.stub_fmu import PROBES, TARGET, build_stub, describe
+from servobench.harness.batch import results
+from servobench.plant.contract.settings import remark
+from servobench.plant.fmu.mapping import FmuMapping, read_mapping
+from servobench.plant.fmu.world import FmuWorld
+
+TIP = (0.5 * np.cos(0.3) + 0.4 * np.cos(1.5), 0.5 * np.sin(0.3) + 0.4 * np.sin(1.5))
+EXPERIMENT = '<DefaultExperiment startTime="{}" stopTime="20"/>'
+MOVES = "MOVES_BEFORE=9.99"
+
+
+@pytest.fixture(autouse=True)
+def fresh(tmp_path, monkeypatch):
+    """A cache of its own, and remarks that were made before are made again."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    remark.cache_clear()
+
+
+def run(monkeypatch, mapping, *options: str, out: str = "out") -> int:
+    place = str(mapping.with_name(out))
+    words = ("run", "--plant", f"fmu:{mapping}", "--controller", "ukf_mfac", *TARGET, "--no-figures", "--out", place)
+    return servobench(monkeypatch, *words, *options)
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Return a function that opens the world of a stub; all are closed at the end."""
+    worlds = []
+
+    def open_world(*macros: str, period: float = 0.05, more: str = "", **stub) -> FmuWorld:
+        mapping = build_stub(tmp_path, *macros, **stub)
+        mapping.write_text(mapping.read_text() + more)
+        worlds.append(FmuWorld(read_mapping(FmuMapping, mapping), None, period))
+        return worlds[-1]
+
+    yield open_world
+    for world in worlds:
+        world.close()
+
+
+@pytest.mark.parametrize(
+    ("experiment", "more", "begins", "noted"),
+    [
+        (EXPERIMENT.format("10"), "", 10.0, True),
+        (EXPERIMENT.format("1e1"), "start_time = 2.0\n", 2.0, False),
+        ("", "start_time = 10.0\n", 10.0, False),
+        ("", "", 0.0, False),
+        ('<DefaultExperiment stopTime="20"/>', "", 0.0, False),
+    ],
+)
+def test_a_run_begins_at_the_start_time_of_the_experiment_or_of_the_mapping(
+    opened, caplog, experiment, more, begins, noted
+):
+    world = opened(MOVES, description=describe(experiment), more=more)
+    before = 0.05 * (begins < 9.99)
+    np.testing.assert_allclose(world.truth().feature, np.add(TIP, (0.0, before)), atol=1e-15)
+    world.advance(np.array([0.1, 0.0]))
+    world.reset(0)
+    np.testing.assert_allclose(world.see(), np.add(TIP, (0.0, before)), atol=1e-15)
+    assert ("stub.fmu begins at 10 s, the startTime of its default experiment" in caplog.text) == noted
+
+
+def test_the_clock_of_an_fmu_goes_on_from_its_start_time(opened):
+    world = opened(MOVES, more="start_time = 9.9\n")
+    seen = []
+    for _ in range(4):
+        world.advance(np.zeros(2))
+        seen.append(world.see()[1] - TIP[1])
+    np.testing.assert_allclose(seen, [0.05, 0.0, 0.0, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "message"),
+    [
+        ("1e300", "", r"steps of 0.05 s from 1e\+300 s, the startTime of its default experiment: write"),
+        ("soon", "", "from nan s, the startTime of its default experiment: write start_time = 0.0 into the mapping"),
+        ("INF", "", "from inf s, the startTime"),
+        ("0", "start_time = 1e18\n", r"from 1e\+18 s, the start_time of the mapping"),
+    ],
+)
+def test_a_start_time_in_which_steps_are_lost_is_refused(opened, text, more, message):
+    with pytest.raises(ValueError, match=f"stub.fmu cannot take .*{message}"):
+        opened(description=describe(EXPERIMENT.format(text)), more=more)
+
+
+@pytest.mark.parametrize(
+    ("macros", "jumps"),
+    [
+        (("LOOKS_AFTER=0",), "y[1] (to 0.506 in step 1), y[2] (to 0.547 in step 1)"),
+        (("LOOKS_AFTER=2",), "y[1] (to 0.506 in step 3), y[2] (to 0.547 in step 3)"),
+        (("LOOKS_AFTER=0", "HEIGHT=10*s->time"), "y[1] (to 0.506 in step 1)"),  # y[2] rises evenly from 0
+        ((), ""),
+        (("HEIGHT=0",), ""),
+        (("HEIGHT=s->time*s->time",), ""),
+        (("HEIGHT=sin(s->time)",), ""),
+    ],
+)
+def test_outputs_that_jump_from_exactly_0_in_the_first_steps_are_remarked_on(opened, caplog, macros, jumps):
+    opened(*macros).rehearse()
+    lines = [line for line in caplog.messages if "returns 0 at the start for what then jumps" in line]
+    assert [f"rests: {jumps}; runs begin with a wrong measurement" in line for line in lines] == [True] * bool(jumps)
+
+
+def test_the_command_line_remarks_on_late_outputs_and_runs_as_before(monkeypatch, tmp_path, caplog):
+    mapping = build_stub(tmp_path, "LOOKS_AFTER=0")
+    assert run(monkeypatch, mapping, *PROBES) == 0
+    assert caplog.text.count("stub.fmu returns 0 at the start for what then jumps") == 1
+    assert results.load_runs(tmp_path / "out")["status"].tolist() == ["completed"]
