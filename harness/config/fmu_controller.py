@@ -29,7 +29,7 @@ from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import NUMERIC, FmuDescription, read_description, total_size
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.mapping import STEP_TOLERANCE, check_roles, check_unit, first_instant, read_mapping
+from servobench.plant.fmu.mapping import check_roles, check_unit, count_steps, first_instant, read_mapping
 from servobench.plant.fmu.world import read_sized, setters
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -116,7 +116,8 @@ class FmuController(Controller):
         inputs = [variable.name for variable in self._description.variables if variable.causality == "input"]
         if idle := [name for name in inputs if name not in taken]:
             remark(f"{file}: no role of the mapping names the input {idle[0]}, which keeps its start value")
-        if (usual := self._description.usual_step) is not None and abs(usual - self._period) > STEP_TOLERANCE * usual:
+        usual = self._description.usual_step
+        if usual is not None and count_steps(self._period, usual) != 1:
             remark(f"{file} is meant for a period of {usual:g} s, and run.period is {self._period:g} s")
         came = total_size(found["reference"])
         rows, rest = divmod(came, m)

@@ -11,6 +11,7 @@ The keys are the fields of `FmuMapping`, its sections the fields of their own cl
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import MISSING, field, fields, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar, cast
 
@@ -43,6 +44,8 @@ DECLARED: Final = {unit for units in UNITS.values() for unit in units if unit no
 }  # fmt: skip
 REPEATED: Final = {"seen", "truth.jacobian", "jacobian"}  # outputs that may be named more than once, such as one flag
 STEP_TOLERANCE: Final = 1e-6  # tolerated deviation of a step from a multiple of the FMU's own, over the step
+WHOLE_TOLERANCE: Final = 1e-9  # [s] between a period and its steps
+MIN_DIGITS: Final = 4  # A step with fewer digits is exact.
 MAX_STEP_ERROR: Final = 1e-3  # relative error of a step from one instant of an FMU's clock to the next
 
 
@@ -173,11 +176,12 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     Raises:
         ValueError: a name that the FMU does not have, sizes that do not fit together, or a step that it cannot take.
     """
-    step, own = mapping.period or period, description.internal_step
-    if own is not None and abs(round(step / own) * own - step) > STEP_TOLERANCE * step:
+    step = own_step(mapping.period, period)
+    own = description.internal_step
+    if own is not None and not count_steps(step, own):
         raise ValueError(
-            f"{description.path.name} takes steps of multiples of {own:g} s only (fixedInternalStepSize), so period "
-            f"must be one, got {step:g} s"
+            f"{description.path.name} takes steps of multiples of {own!r} s only (fixedInternalStepSize), so period "
+            f"must be one, got {step!r} s"
         )
     n, m = (total_size(description.select(getattr(mapping, role), role)) for role in ("inputs", "features"))
     if not (n and m):
@@ -252,12 +256,42 @@ def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float
     One of model exchange is integrated with steps of its solver's.
     """
     usual = description.usual_step
-    if mapping.period is not None or usual is None or description.exchange or usual >= period * (1.0 - STEP_TOLERANCE):
+    if mapping.period is not None or usual is None or description.exchange:
+        return ""
+    if usual >= period or count_steps(period, usual) == 1:
         return ""
     return (
         f"{description.path.name} is meant to take steps of {usual:g} s and takes those of the control period, "
         f"{period:g} s; period = {usual:g} in the mapping changes that"
     )
+
+
+def own_step(written: float | None, period: float) -> float:
+    """Return the step of an FMU, s: that of its mapping, or the part of a period [s] that is rounded there."""
+    if written is None:
+        return period
+    count = count_steps(period, written)
+    if count and abs(count * written - period) > WHOLE_TOLERANCE:
+        return period / count
+    return written
+
+
+def count_steps(period: float, written: float) -> int:
+    """Return how many steps of an FMU a period has, 0 where they do not fit.
+
+    Args:
+        period: s.
+        written: the step as in a file, s, where 1/60 s is 0.0166667.
+    """
+    count = max(1, round(period / written))
+    exact = period / count
+    _, digits, exponent = Decimal(repr(written)).as_tuple()
+    last = 10.0 ** float(exponent)  # value of a one as the last digit
+    is_near = abs(exact - written) <= STEP_TOLERANCE * exact
+    is_rounded = len(digits) >= MIN_DIGITS and -0.5 < (exact - written) / last < 1.0  # also where digits were cut off
+    if is_near or (is_rounded and count * last < 0.1 * written):
+        return count
+    return 0
 
 
 def first_instant(given: float | None, description: FmuDescription, step: float) -> float:

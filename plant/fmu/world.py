@@ -29,7 +29,7 @@ from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
-from servobench.plant.fmu.mapping import FmuMapping, first_instant, mapping_spec, read_mapping, unusual_step
+from servobench.plant.fmu.mapping import FmuMapping, first_instant, mapping_spec, own_step, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import build_model
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
@@ -95,8 +95,9 @@ class FmuWorld(World):
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
             FmuError: the FMU refused its parameters or its initialisation.
         """
-        self._substeps = whole_steps(period, mapping.period or period)
-        self._own_step, self._period = mapping.period or period, period
+        self._own_step = own_step(mapping.period, period)
+        self._substeps = whole_steps(period, self._own_step)
+        self._period = period
         self._mapping, self.lag = mapping, lag
         self.description = description = read_sized(mapping.file, mapping.parameters)
         if description.needs_tool:

@@ -112,3 +112,47 @@ def test_the_command_line_remarks_on_late_outputs_and_runs_as_before(monkeypatch
     assert run(monkeypatch, mapping, *PROBES) == 0
     assert caplog.text.count("stub.fmu returns 0 at the start for what then jumps") == 1
     assert results.load_runs(tmp_path / "out")["status"].tolist() == ["completed"]
+
+
+SIXTY, THIRTY = 1.0 / 60.0, 1.0 / 30.0
+
+
+@pytest.mark.parametrize(
+    ("period", "internal", "more", "steps"),
+    [
+        (SIXTY, "0.0166667", "", 1),
+        (SIXTY, "0.016667", "", 1),
+        (SIXTY, "0.016666", "", 1),  # digits were cut off
+        (SIXTY, "0.008333", "", 1),
+        (SIXTY, "0.00833333", "", 1),
+        (THIRTY, "0.033333", "", 1),
+        (THIRTY, "0.0166667", "", 1),
+        (THIRTY, "0.0166667", "period = 0.0166667\n", 2),
+        (THIRTY, "0.033333", "period = 0.033333\n", 1),
+        (1.0 / 7.0, "0.0142857", "period = 0.0142857\n", 10),
+        (0.05, "0.01", "period = 0.01\n", 5),
+        (0.05, "0.0166667", "", 1),
+    ],
+)
+def test_a_step_that_a_file_rounds_is_the_part_of_the_period_that_was_meant(opened, period, internal, more, steps):
+    description = describe(interface=f'fixedInternalStepSize="{internal}"')
+    world = opened(description=description, more=more, period=period)
+    for _ in range(3):
+        joints = world.advance(np.array([0.6, -0.6]))
+    np.testing.assert_allclose(joints, np.array([0.3, 1.2]) + 3 * period * np.array([0.6, -0.6]), rtol=1e-14)
+    assert world._own_step * steps == pytest.approx(period, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("period", "internal", "more", "message"),
+    [
+        (SIXTY, "0.0167", "", "multiples of 0.0167 s only .* got 0.016666666666666666 s"),
+        (SIXTY, "0.01668", "period = 0.0166667\n", "multiples of 0.01668 s only .* got 0.016666666666666666 s"),
+        (THIRTY, "0.033", "", "multiples of 0.033 s only .* got 0.0333"),
+        (0.05, "0.016668", "", "multiples of 0.016668 s only .* got 0.05 s"),
+        (0.05, "0.01", "period = 0.0124\n", "whole multiple of the plant's own step of 0.0124 s, got 0.05 s"),
+    ],
+)
+def test_a_step_that_is_no_rounded_part_of_the_period_is_refused_in_full(opened, period, internal, more, message):
+    with pytest.raises(ValueError, match=message):
+        opened(description=describe(interface=f'fixedInternalStepSize="{internal}"'), more=more, period=period)
