@@ -44,6 +44,7 @@ from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import COMPLETED, CRASHED, LOST, Ending, RunResult, ends_batch
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.settings import REMARKS, remark
+from servobench.plant.fmu.release import delayed_releases
 
 BLOCK: Final = 256  # [runs] that advance together: networks of more of them leave the cache of a processor
 RUN_ID: Final = "run_id"
@@ -226,15 +227,16 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
 
 def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
     """Build a run in a worker and report the training of its networks, and a wrong configuration."""
-    try:
-        block, *_ = _receive(packed)
-        tell(None)
-        with registry.offering(block.own):
-            build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
-    except ConfigurationError as error:
-        tell(str(error))
-    for text in REMARKS:
-        tell(["remark", text])
+    with delayed_releases():
+        try:
+            block, *_ = _receive(packed)
+            tell(None)
+            with registry.offering(block.own):
+                build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
+        except ConfigurationError as error:
+            tell(str(error))
+        for text in REMARKS:
+            tell(["remark", text])
 
 
 def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
@@ -245,7 +247,13 @@ def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -
         tell({"unreadable": astuple(Ending.of(error))})
         return
     tell(None)  # the time limit begins after the imports
-    _carry_out(block, lambda result: tell(pack_result(result)), steps, keep, debug=False)
+    with delayed_releases() as release:
+
+        def answer(result: RunResult) -> None:
+            tell(pack_result(result))
+            release()
+
+        _carry_out(block, answer, steps, keep, debug=False)
 
 
 def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:

@@ -35,7 +35,7 @@ from typing import Any, Final, TypeAlias
 
 from servobench.harness.batch import processes
 from servobench.harness.batch.processes import Limits, show_size
-from servobench.harness.run.result import CRASHED, LOST, OUT_OF_MEMORY, TIMED_OUT, Ending
+from servobench.harness.run.result import CRASHED, INSTANT, LOST, OUT_OF_MEMORY, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError
 
 LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
@@ -355,6 +355,7 @@ class _Guard:
         runner.start()  # an OSError where the system has no more processes
         theirs.close()
         self._below, self._runner, self._owner, self._answers = below, runner, task.owner, 0
+        INSTANT.value = math.nan
         return below
 
     def _watch(self, below: Connection, wanted: int | None) -> End | None:
@@ -413,7 +414,7 @@ class _Guard:
     def _find_end(self) -> End:
         """Return the end of a runner that is gone, or whose link is."""
         code = processes.await_end(self._runner, TRACE_TIME)
-        return self._end(CRASHED, LOST + _describe_exit(code), certain=False)
+        return self._end(CRASHED, LOST + _describe_exit(code) + _describe_instant(), certain=False)
 
     def _end(self, status: str, reason: str, *, certain: bool = True) -> End:
         """End the runner and all below it."""
@@ -471,6 +472,13 @@ def _be_runner(link: Connection, inherited: Sequence[Connection], limits: Limits
         with contextlib.suppress(BaseException):
             os.write(trace, traceback.format_exc().encode())
     os._exit(1)
+
+
+def _describe_instant() -> str:
+    """Return the addition to a reason that the time of the run makes; empty where no run was carried out."""
+    if INSTANT.value == -math.inf:
+        return ", before its first period"
+    return "" if math.isnan(INSTANT.value) else f", in the period from {INSTANT.value:.6g} s on"
 
 
 def _describe_exit(code: int | None) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -23,7 +24,7 @@ from servobench.harness.run.metrics import final_rows, judge_run
 from servobench.harness.run.outcome import find_outcome, pose_errors
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
-from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch
+from servobench.harness.run.result import COMPLETED, INSTANT, Ending, RunResult, ends_batch
 from servobench.plant.bench.bench import Bench
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
@@ -51,6 +52,7 @@ def carry_out(
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
+    INSTANT.value = -math.inf
     experiment = build(resolved)
     log, ending = StepLog(experiment.plant.spec, experiment.periods), Ending()
     with same_folder(), contextlib.closing(experiment.plant) as plant, careful():

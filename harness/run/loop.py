@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import Period, StepLog
+from servobench.harness.run.result import INSTANT
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
@@ -103,6 +104,7 @@ def periods(rollout: Rollout, controller: Controller) -> Iterator[Period]:
     """
     while rollout.running:
         observation, reference = rollout.observation, rollout.reference
+        INSTANT.value = observation.time
         began = perf_counter_ns()
         command = controller.step(observation, reference)
         decided = perf_counter_ns()

@@ -7,7 +7,9 @@ package. A `RunFault` is no defect and has a place only if a plug-in raised it.
 
 from __future__ import annotations
 
+import ctypes
 import inspect
+import mmap
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -30,6 +32,9 @@ TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
 NETWORKS: Final = "networks"  # folder of trained networks, of the cache and of results
 LOST: Final = "the run killed the process that carried it out"
+
+# [s] The last control instant of the run that this process carries out, shared with the process above; -inf before it.
+INSTANT: Final = ctypes.c_double.from_buffer(mmap.mmap(-1, 8))
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
 HARNESS = str(PACKAGE_FOLDER / "harness")

@@ -25,6 +25,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
 from servobench.plant.fmu.library import Library, MessageLog
+from servobench.plant.fmu.release import release
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # type of a variable -> word in the names of functions, type in memory
@@ -289,17 +290,26 @@ class Instance(ABC):
             self._free(state)
 
     def close(self) -> None:
-        """End and free the instance with its saved states and unload its library; calling it twice is allowed."""
+        """End and free the instance with its saved states and unload its library; see `release`.
+
+        Calling it twice is allowed.
+        """
+        release(self._release)
+
+    def _release(self) -> None:
         if self._component.value and not self.library.condemned:
-            for state in self._states:
-                self._free(state)
+            with contextlib.suppress(FmuError):  # The run has ended.
+                for state in self._states:
+                    self._free(state)
             if self._begun:
-                with contextlib.suppress(ValueError):  # The FMU may not export it.
+                with contextlib.suppress(FmuError):
                     self.function("Terminate")(self._component)
-            release = self.function("FreeInstance")
-            release.restype = None
-            release(self._component)
-        self._component, self._begun = ctypes.c_void_p(), False
+            with contextlib.suppress(FmuError):
+                free = self.function("FreeInstance")
+                free.restype = None
+                free(self._component)
+        self._component = ctypes.c_void_p()
+        self._begun = False
         self.library.unload()
 
     def check(self, function: str, status: int) -> None:
@@ -324,13 +334,13 @@ class Instance(ABC):
         """Return a function of the library by its name without prefix.
 
         Raises:
-            ValueError: the library does not have it.
+            FmuError: the library does not have it.
         """
         try:
             return getattr(self.library.loaded, f"{self.prefix}{name}")
         except AttributeError as error:
             file = self.description.path.name
-            raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error
+            raise FmuError(f"the library in {file} does not export {self.prefix}{name}") from error
 
 
 class Integrator:

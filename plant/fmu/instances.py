@@ -190,12 +190,18 @@ class Instance2(Instance):
 
     def _reached(self, status: int, time: float) -> float | None:
         if status != DISCARD:
-            self.check("fmi2DoStep", status)
+            self.check(f"at {time:.6g} s, fmi2DoStep", status)
             return None
         reached = ctypes.c_double()
         query = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
-        if self.function("GetRealStatus")(self._component, *query) != OK:
-            raise self.log.failure("fmi2DoStep", "discard and not how far it came")
+        lack = "not how far it came"
+        try:
+            told = self.function("GetRealStatus")(self._component, *query)
+        except FmuError as fault:
+            told = DISCARD
+            lack += f": {fault}"
+        if told != OK:
+            raise self.log.failure(f"at {time:.6g} s, fmi2DoStep", f"discard and {lack}")
         return reached.value
 
     def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
@@ -278,7 +284,7 @@ class Instance3(Instance):
         return again.value, ends.value, following.value if has_next.value else math.inf
 
     def _reached(self, status: int, time: float) -> float | None:
-        self.check("fmi3DoStep", status)
+        self.check(f"at {time:.6g} s, fmi3DoStep", status)
         if self._end.value:
             raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
         return self._last_time.value if self._early.value else None

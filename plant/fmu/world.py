@@ -31,6 +31,7 @@ from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_in
 from servobench.plant.fmu.library import logger
 from servobench.plant.fmu.mapping import FmuMapping, first_instant, mapping_spec, own_step, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import build_model
+from servobench.plant.fmu.release import release
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import RobotModel
 
@@ -338,8 +339,12 @@ class FmuWorld(World):
         self._measure()
 
     def close(self) -> None:
-        """Free all instances and unload the library."""
+        """Free all instances and unload the library, and let go of the models, which have instances as well."""
+        release(self._free)
+
+    def _free(self) -> None:
         self._instances.close()
+        self._true = self._nominal = None
 
 
 def read_sized(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> FmuDescription:

@@ -1,14 +1,24 @@
 """Habits and faults of foreign FMUs: clocks, late outputs, odd archives, lacking functions, bad ends."""
 
+import multiprocessing
+import pickle
+
 import numpy as np
 import pytest
 
 from kit.command import servobench
 from kit.stub_fmu import PROBES, TARGET, build_stub, describe
 from servobench.harness.batch import results
+from servobench.harness.batch.blocks import Block, Job, _carry_out_there, unpack_result
+from servobench.harness.batch.plan import Cell
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolution import resolve
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.settings import remark
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
+from servobench.plant.robot.mismatch import Mismatch
 
 TIP = (0.5 * np.cos(0.3) + 0.4 * np.cos(1.5), 0.5 * np.sin(0.3) + 0.4 * np.sin(1.5))
 EXPERIMENT = '<DefaultExperiment startTime="{}" stopTime="20"/>'
@@ -156,3 +166,61 @@ def test_a_step_that_a_file_rounds_is_the_part_of_the_period_that_was_meant(open
 def test_a_step_that_is_no_rounded_part_of_the_period_is_refused_in_full(opened, period, internal, more, message):
     with pytest.raises(ValueError, match=message):
         opened(description=describe(interface=f'fixedInternalStepSize="{internal}"'), more=more, period=period)
+
+
+@pytest.mark.parametrize(
+    ("macros", "reason"),
+    [
+        (("ENDS_EARLY=0.12",), "discard and not how far it came: the library in stub.fmu does not export fmi2GetReal"),
+        (("ENDS_EARLY=0.12", "HAS_STATUS"), "discard and not how far it came; the FMU said: step too long"),
+    ],
+)
+def test_a_step_that_an_fmu_discards_without_a_time_is_an_fmu_error_with_its_reason(opened, macros, reason):
+    world = opened(*macros)
+    for _ in range(3):
+        world.advance(np.zeros(2))
+    with pytest.raises(FmuError, match=f"stub.fmu: at 0.15 s, fmi2DoStep returned {reason}"):
+        world.advance(np.zeros(2))
+
+
+def test_functions_that_an_fmu_lacks_are_named_where_they_are_needed(opened):
+    world = opened("NO_RESET", "NO_FREE")
+    world.advance(np.zeros(2))
+    with pytest.raises(FmuError, match="the library in stub.fmu does not export fmi2Reset"):
+        world.reset(0)
+    world.close()  # without fmi2FreeInstance
+    world = opened(description=describe(interface='canGetAndSetFMUstate="true"'))
+    with pytest.raises(FmuError, match="the library in stub.fmu does not export fmi2GetFMUstate"):
+        world.save()
+
+
+ENDS = ("AT_FREE=abort()", "AT_TERMINATE=exit(3)", "AT_UNLOAD=*(volatile int *)0=0", "AT_FREE=hang()")
+
+
+@pytest.mark.parametrize("macro", ENDS)
+def test_a_run_that_ended_well_stays_whatever_its_library_does_at_the_end(monkeypatch, tmp_path, caplog, macro):
+    monkeypatch.setattr("servobench.plant.fmu.release.RELEASE_TIME", 0.2)
+    monkeypatch.setenv("STUB_MAY_FALL", "1")
+    context = multiprocessing.get_context("fork")  # as that of a runner
+    ours, theirs = context.Pipe()
+    request = RunRequest(f"fmu:{build_stub(tmp_path, macro)}", "ukf_mfac", "target", Mismatch(), 0)
+    settings = {"target": {"target": [0.1, 0.75], "duration": 0.2}, "ukf_mfac": {"initial": {"source": "probe"}}}
+    job = Job(0, Cell(request), resolve(request, Settings(settings)))
+    task = ((), pickle.dumps((Block((job,)), False, None)))
+    process = context.Process(target=_carry_out_there, args=(task, theirs.send))
+    process.start()
+    theirs.close()
+    assert ours.recv() is None
+    assert unpack_result(job, ours.recv()).row["status"] == "completed"
+    process.join(20.0)
+    assert process.exitcode not in (None, 0)
+
+
+def test_a_crash_costs_no_other_run_and_names_its_instant(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("STUB_MAY_FALL", "1")
+    late = ("--set", "ukf_mfac.initial.source=given", "--set", "ukf_mfac.initial.given=[[0, 1], [1, 0]]")
+    mapping = build_stub(tmp_path, "AT_UNLOAD=abort()", "FALLS_AFTER=0.42")
+    assert run(monkeypatch, mapping, *PROBES[:2], *PROBES[4:], *late) == 1
+    (row,) = results.load_runs(tmp_path / "out").to_dict("records")
+    assert row["status"] == "crashed"
+    assert row["reason"].endswith(": SIGABRT, in the period from 0.45 s on")

@@ -56,7 +56,7 @@ def place(words: str, function: str) -> str:
 
 
 REASONS = {
-    "exit": ("crashed", "the run killed the process that carried it out: exit code 9"),
+    "exit": ("crashed", "the run killed the process that carried it out: exit code 9, in the period from 0 s on"),
     "build": ("crashed", f"RuntimeError: no licence {place('no licence', 'build')}"),
     "close": ("crashed", f"RuntimeError: the window is gone {place('the window is gone', 'fail')}"),
     "hang": ("timed_out", "the run took longer than 8 s"),

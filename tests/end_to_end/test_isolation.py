@@ -22,14 +22,14 @@ LIMITS = ("--run-timeout", "8", "--run-memory", "600MB")
 KILLED = "the run killed the process that carried it out"
 IN_LINE = r" \(hostile_controllers.py:\d+ in \w+\.strike\)"
 WANTED = {  # by controller: status and reason of its runs
-    "ExitsWhileBuilt": ("crashed", f"{KILLED}: exit code 3"),
+    "ExitsWhileBuilt": ("crashed", f"{KILLED}: exit code 3, before its first period"),
     "Raises": ("crashed", f"KeyError: 'gain'{IN_LINE}"),
     "RaisesUnspeakable": ("crashed", f"Unspeakable: its text cannot be had, which raises RuntimeError{IN_LINE}"),
     "Leaves": ("crashed", f"SystemExit: 4{IN_LINE}"),
     "Interrupts": ("crashed", f"KeyboardInterrupt{IN_LINE}"),
     "InterruptsItself": ("completed", ""),
-    "Exits": ("crashed", f"{KILLED}: exit code 9"),
-    "Segfaults": ("crashed", f"{KILLED}: SIGSEGV"),
+    "Exits": ("crashed", f"{KILLED}: exit code 9, in the period from .* s on"),
+    "Segfaults": ("crashed", f"{KILLED}: SIGSEGV, in the period from .* s on"),
     "EndsItsParent": ("crashed", KILLED),
     "StopsItsParent": ("timed_out", "the run took longer than 8 s"),
     "Forges": ("crashed", "the answer of the run cannot be read: it is not the result of a run"),
