@@ -4,6 +4,7 @@ All processes share the folder and none writes into it; a second plant of the sa
 is judged by its table of contents before a byte is unpacked; Python's reader never unpacks more than that says.
 """
 
+import contextlib
 import errno
 import lzma
 import zipfile
@@ -22,6 +23,8 @@ MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
 MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
 MAX_RATIO: Final = 100.0  # unpacked size over that of the archive; libraries reach 5, tables of numbers 20
 SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
+USUAL_ENCODING: Final = "cp437"  # in which Python's reader takes names without a mark
+UTF8_MARK: Final = 0x800
 # Errors of the disk, not of the archive.
 DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
 DAMAGES: Final = (  # raised by Python's reader of archives
@@ -49,6 +52,8 @@ def _extract(path: Path, folder: Path) -> None:
         archive = zipfile.ZipFile(path)
     with archive:
         entries = archive.infolist()
+        for entry in entries:
+            entry.filename = _place_of(entry)
         _check_names(path, entries)
         _check_sizes(path, entries)
         for entry in entries:
@@ -60,13 +65,26 @@ def _extract(path: Path, folder: Path) -> None:
                 raise ValueError(f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}") from error
 
 
+def _place_of(entry: zipfile.ZipInfo) -> str:
+    """Return the name of an entry with `/` between folders, and its letters also of UTF-8 without a mark."""
+    name = entry.filename
+    if not entry.flag_bits & UTF8_MARK:
+        with contextlib.suppress(UnicodeError):
+            name = name.encode(USUAL_ENCODING).decode("utf-8")
+    return name.replace("\\", "/")
+
+
 def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    names = [entry.orig_filename for entry in entries]
-    for name in names:
-        parts = PurePosixPath(name.replace("\\", "/"))
-        if "\\" in name or ":" in name or parts.is_absolute() or ".." in parts.parts:
-            raise ValueError(f"fmu file {path} holds {name!r}, which would climb out of the folder it is extracted to")
-    if DESCRIPTION not in names:
+    written = {entry.orig_filename for entry in entries}
+    places = {entry.filename for entry in entries}
+    for entry in entries:
+        parts = PurePosixPath(entry.filename)
+        if ":" in entry.filename or parts.is_absolute() or ".." in parts.parts:
+            name = repr(entry.orig_filename)
+            raise ValueError(f"fmu file {path} holds {name}, which would climb out of the folder it is extracted to")
+    if len(places) < len(written):
+        raise ValueError(f"fmu file {path} holds a file twice, with '/' and with '\\' in its name")
+    if DESCRIPTION not in places:
         raise ValueError(f"fmu file {path} holds no {DESCRIPTION}, so it is not an FMU")
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
-from servobench.plant.fmu.library import MessageLog
+from servobench.plant.fmu.library import MessageLog, plain_root
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
@@ -162,7 +162,7 @@ class Instance2(Instance):
             self.description.model_name.encode(),
             ctypes.c_int(MODEL_EXCHANGE if self.description.exchange else CO_SIMULATION),
             self.description.token.encode(),
-            (self.description.root / "resources").as_uri().encode(),
+            (plain_root(self.description.root) / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
             ctypes.c_int(0),
             ctypes.c_int(self._debugs),
@@ -256,7 +256,8 @@ class Instance3(Instance):
         create = self.function("InstantiateModelExchange" if exchange else "InstantiateCoSimulation")
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
-        names = self.description.model_name, self.description.token, str(self.description.root / "resources") + os.sep
+        resources = plain_root(self.description.root) / "resources"
+        names = self.description.model_name, self.description.token, str(resources) + os.sep
         common = [*(name.encode() for name in names), no, ctypes.c_bool(self._debugs)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]

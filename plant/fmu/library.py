@@ -2,10 +2,12 @@
 
 import ctypes
 import logging
+import os
 import shutil
 import tempfile
 from collections import deque
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -78,6 +80,19 @@ def _load_copy(file: Path) -> ctypes.CDLL:
         prefix=f"{UNFINISHED}servobench-", dir=place, ignore_cleanup_errors=True
     ) as folder:
         return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
+
+
+@cache
+def plain_root(root: Path) -> Path:
+    """Return a path to an extracted FMU without letters that a URI encodes, which many FMUs do not decode.
+
+    It is valid as long as this process lives; where the system has none, it is `root`.
+    """
+    if root.as_uri() != f"file://{root}":
+        plain = Path(f"/proc/{os.getpid()}/fd/{os.open(root, os.O_RDONLY)}")
+        if plain.is_dir():
+            return plain
+    return root
 
 
 logger = logging.getLogger("servobench.fmu")

@@ -224,3 +224,17 @@ def test_a_crash_costs_no_other_run_and_names_its_instant(monkeypatch, tmp_path,
     (row,) = results.load_runs(tmp_path / "out").to_dict("records")
     assert row["status"] == "crashed"
     assert row["reason"].endswith(": SIGABRT, in the period from 0.45 s on")
+
+
+@pytest.mark.parametrize("separator", ["/", "\\"])
+@pytest.mark.parametrize("name", ["gain.txt", "größe.txt", "a b.txt"])
+def test_an_archive_with_any_separator_and_letters_runs(opened, separator, name):
+    world = opened(f'OPENS="{name}"', separator=separator, files=(name,))
+    np.testing.assert_allclose(world.see(), TIP, atol=1e-15)
+
+
+@pytest.mark.parametrize("folder", ["with blank", "ü", "100 %", "a#b?c", "plain"])
+def test_an_fmu_that_does_not_decode_its_uri_finds_its_resources(opened, tmp_path, monkeypatch, folder):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / folder))
+    world = opened('OPENS="gain.txt"', files=("gain.txt",))
+    np.testing.assert_allclose(world.see(), TIP, atol=1e-15)

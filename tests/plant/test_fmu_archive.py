@@ -145,3 +145,26 @@ def test_cuts_and_flips_of_an_archive_are_read_or_refused_in_one_line(tmp_path):
                 refusals.append(str(error))
     assert len(refusals) > 20
     assert [each for each in refusals if "\n" in each or not each.startswith(f"fmu file {path} ")] == []
+
+
+@pytest.mark.parametrize("name", ["..\\x", "a\\..\\..\\x", "C:\\x", "\\x", "\\\\server\\x", "a\\../../x", "../x", "/x"])
+def test_a_name_that_climbs_with_any_separator_is_refused(tmp_path, name):
+    assert f"holds {name!r}, which would climb out" in refused(pack(tmp_path / "a.fmu", {name: b"x"}))
+
+
+def test_backslashes_of_an_archive_are_separators_also_of_folders_alone(tmp_path):
+    path = pack(tmp_path / "a.fmu", {"resources\\": b"", "resources\\deep\\": b"", "resources\\deep/x": b"1"})
+    assert (extract_fmu(path) / "resources" / "deep" / "x").read_bytes() == b"1"
+    again = pack(tmp_path / "b.fmu", {"resources\\x": b"1", "resources/x": b"2"})
+    assert "holds a file twice, with '/' and with" in refused(again)
+
+
+def test_names_in_utf_8_without_a_mark_keep_their_letters(tmp_path):
+    path = pack(tmp_path / "a.fmu", {"resources/größe.txt": b"1", "resources/gain.txt": b"2"})
+    content = path.read_bytes()
+    marked = [i for i in range(len(content)) if content[i : i + 4] in (b"PK\3\4", b"PK\1\2")]
+    for i in marked:
+        flags = i + (6 if content[i : i + 4] == b"PK\3\4" else 8)
+        content = content[: flags + 1] + bytes([content[flags + 1] & ~0x08]) + content[flags + 2 :]
+    path.write_bytes(content)
+    assert sorted(each.name for each in (extract_fmu(path) / "resources").iterdir()) == ["gain.txt", "größe.txt"]
