@@ -330,6 +330,8 @@ def _in_own_unit(name: str, written: object, unit: Callable[[], str]) -> object:
     parts = split_quantity(written) if isinstance(written, str) else None
     if parts is None or not unit() or (unit() == EXTENT and parts[1] == "px"):
         return written
+    if "/" in str(written) and not parts[1]:
+        return parts[0]
     try:
         number = in_own_unit(*parts, unit())
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Units in which users may write quantities, such as `80ms`, `60deg`, `2px` or `125Hz`.
+"""Units in which users may write quantities, such as `80ms`, `60deg`, `2px`, `125Hz` or `1/30`.
 
 A setting's own unit stands in brackets at the begin of the string below its field; a plain number is in this unit.
 """
@@ -24,13 +24,17 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # own unit -> unit -> how m
 }
 RATES: Final[Mapping[str, str]] = {"Hz": "s"}  # unit -> own unit of which it is the reciprocal
 SPELLINGS: Final = str.maketrans({"°": "deg", "µ": "u", "μ": "u"})
-QUANTITY: Final = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(.*)", re.IGNORECASE)
+NUMBER: Final = r"(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+QUANTITY: Final = re.compile(rf"([-+]?{NUMBER})(?:\s*/\s*({NUMBER}))?\s*(.*)", re.IGNORECASE)
 
 
 def split_quantity(text: str) -> tuple[float, str] | None:
-    """Return the number and the unit of a text such as `80ms`; None for a text that does not begin with a number."""
+    """Return the number and the unit of a text such as `80ms` or `1/30 s`; None for one that begins with no number."""
     match = QUANTITY.fullmatch(text.strip())
-    return None if match is None else (float(match[1]), match[2].translate(SPELLINGS))
+    divisor = 1.0 if match is None else float(match[2] or 1.0)
+    if match is None or divisor == 0.0:
+        return None
+    return float(match[1]) / divisor, match[3].translate(SPELLINGS)
 
 
 def units_of(own: str) -> list[str]:

@@ -46,6 +46,7 @@ def test_settings_take_units():
     config = read("kinematic.sensing.latency=80ms")
     assert config.sensing.latency == 0.08
     assert read("kinematic.sensing.occlusion_windows=[['100ms', 0.5]]").sensing.occlusion_windows == ((0.1, 0.5),)
+    assert read("run.period=1/30").period == read("run.period=1/30 s").period == read("run.period=30Hz").period
     assert read("kinematic.sensing.feature_noise=2px").sensing.feature_noise == "2px"
     assert read("kinematic.sensing.feature_noise=2mm").sensing.feature_noise == 0.002
     assert read("run.period=125Hz").period == 0.008
@@ -57,6 +58,7 @@ def test_settings_take_units():
         ("kinematic.lag=-80ms", "kinematic.lag must be at least 0ms, got -80ms"),
         ("kinematic.lag=5deg", "kinematic.lag must be a number in s, ms, us, min, Hz, got '5deg'"),
         ("kinematic.lag=0,05", "kinematic.lag must be a number in s, ms, us, min, Hz, got '0,05'"),
+        ("kinematic.lag=1/0", "kinematic.lag must be a number, got '1/0'"),
         ("kinematic.lag=fast", "kinematic.lag must be a number, got 'fast'"),
         ("kinematic.max_joint_speed=-57deg/s", "kinematic.max_joint_speed must be above 0deg/s, got -57deg/s"),
         (
