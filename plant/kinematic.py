@@ -40,7 +40,7 @@ class ArmConfig:
     lag: Delay = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     command_delay: Delay = 0.05
-    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
+    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     mechanics: MechanicsConfig = nested(MechanicsConfig)

@@ -4,9 +4,11 @@
     frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
 
 with the command delay d and the latency l. Command delay, latency and frame period are physical times. Where they are
-no multiples of the control period T, the world advances in equal sub-steps h, the greatest common divisor of all of
-them in whole milliseconds, so that the physical world is the same at every control rate. With N = T/h, the command of
-period k − ⌈(d − j)/N⌉ acts in sub-step j of period k, for a delay of d sub-steps.
+no multiples of the control period T, the world advances in N equal sub-steps h = T/N, the longest of which all of them
+are multiples, so that the physical world is the same at every control rate. Where there is none of half a millisecond
+or more, h is at most 1 ms, delays are rounded to it, and each frame is exposed after the sub-step that is nearest to
+its time, so that a camera keeps its mean rate. The command of period k − ⌈(d − j)/N⌉ acts in sub-step j of period k,
+for a delay of d sub-steps.
 
 Other disturbances of a frame are in `plant.bench.sensor`. Many runs side by side share one bench: their arrays have a
 leading axis, and each run has random streams of its own.
@@ -17,20 +19,24 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self, final
+from typing import Any, Final, NamedTuple, Self, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
 from servobench.plant.bench.sensor import TIME_TOLERANCE, Sensor
-from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.checks import FloatArray, check_number, fewest_parts
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.lanes import take
 from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import BoolArray, Command, Observation, Truth, trusted_observation
 from servobench.plant.robot.mechanics import RippledJacobian
+
+MAX_STEP: Final = 1e-3  # [s] longest sub-step to which times are rounded
+NEGLIGIBLE: Final = 1e-6  # [s] by which a time may be rounded without a remark
 
 
 @dataclass(frozen=True)
@@ -40,8 +46,8 @@ class Timing:
     steps: int  # in a control period, N
     delays: tuple[int, ...]  # [periods] age of the command that acts in each of the N sub-steps of a period
     latency: int  # between exposure and delivery of a frame
-    frames: int  # between two exposures
-    phase: int  # of the exposures, which happen after each sub-step i with i mod `frames` = `phase`
+    frames: float  # between two exposures; a fraction where frames take no whole number of sub-steps
+    phase: int  # of the exposures, which happen after the sub-steps nearest to `phase` + j `frames`, j whole
 
     @classmethod
     def of(cls, period: float, step: float, command_delay: float, sensing: SensingConfig) -> Self:
@@ -54,19 +60,25 @@ class Timing:
             sensing: latency and frame period.
 
         Raises:
-            ValueError: a time that is no multiple of the sub-step.
+            ValueError: a time that is no multiple of the sub-step, but for a frame period in steps of 1 ms or less.
         """
         times = {"period": period, **delays_of(command_delay, sensing)}
         for name, value in times.items():
-            if not _is_multiple(value, step):
+            fits = _is_multiple(value, step) or (name == "frame_period" and step < MAX_STEP + TIME_TOLERANCE)
+            if not fits:
                 raise ValueError(f"{name} must be a multiple of the world's period of {step:g} s, got {value:g} s")
-        steps, delay, latency, frames = (round(value / step) for value in times.values())
+        steps, delay, latency, whole = (round(value / step) for value in times.values())
         delays = tuple(max(0, -((j - delay) // steps)) for j in range(steps))
-        return cls(steps, delays, latency, frames or steps, 0 if frames else -latency % steps)
+        if sensing.frame_period == 0.0:
+            return cls(steps, delays, latency, steps, -latency % steps)
+        if _is_multiple(sensing.frame_period, step):
+            return cls(steps, delays, latency, whole or steps, 0)
+        return cls(steps, delays, latency, sensing.frame_period / step, 0)
 
     def exposes(self, step: int) -> bool:
         """Return whether a frame is exposed after sub-step number `step`."""
-        return step % self.frames == self.phase
+        since = step - self.phase
+        return math.floor((since + 0.5) / self.frames) > math.floor((since - 0.5) / self.frames)
 
 
 def delays_of(command_delay: float, sensing: SensingConfig) -> dict[str, float]:
@@ -77,27 +89,48 @@ def delays_of(command_delay: float, sensing: SensingConfig) -> dict[str, float]:
 def common_step(period: float, command_delay: float, sensing: SensingConfig) -> float:
     """Return the longest sub-step [s] of which the control period and all times of the bench are multiples.
 
-    It is the control period itself where all others are multiples of it, else whole milliseconds.
+    It is the control period itself where all others are multiples of it, whole milliseconds where all are, and else a
+    whole part of the control period. Where none of `MAX_STEP`/2 or more fits, it is the longest one up to `MAX_STEP`.
 
     Raises:
-        ValueError: neither is possible, or a control period that is not positive.
+        ValueError: a control period that is not positive.
     """
     check_number("period", period, above=0.0)
-    times = delays_of(command_delay, sensing)
-    odd = [name for name, value in times.items() if not _is_multiple(value, period)]
-    if not odd:
+    times = delays_of(command_delay, sensing).values()
+    if all(_is_multiple(value, period) for value in times):
         return period
-    for name, value in {"period": period, **times}.items():
-        if not _is_multiple(value, 1e-3):
-            raise ValueError(
-                f"{name} must be a whole number of milliseconds, because {odd[0]} is no multiple of the control "
-                f"period of {period:g} s; got {value:g} s"
-            )
-    return math.gcd(*(round(1000.0 * value) for value in (period, *times.values()))) / 1000.0
+    if all(_is_multiple(value, 1e-3) for value in (period, *times)):
+        return math.gcd(*(round(1000.0 * value) for value in (period, *times))) / 1000.0
+    fewest = fewest_parts(period, MAX_STEP)
+    for parts in range(1, 2 * fewest + 1):
+        step = period / parts
+        if all(_is_multiple(value, step, NEGLIGIBLE) for value in times):
+            return step
+    return period / fewest
 
 
-def _is_multiple(value: float, step: float) -> bool:
-    return abs(round(value / step) * step - value) < TIME_TOLERANCE
+def rounded_to(step: float, period: float, command_delay: float, sensing: SensingConfig) -> tuple[float, SensingConfig]:
+    """Return command delay and sensing with times that are multiples of a sub-step; remark on those that change.
+
+    A frame period that is no multiple of it stays, as frames are exposed after the nearest sub-steps.
+    """
+    times = delays_of(command_delay, sensing)
+    odd = [name for name, value in times.items() if not _is_multiple(value, step)]
+    far = [name for name in odd if not _is_multiple(times[name], step, NEGLIGIBLE)]
+    if far:
+        named = ", ".join(far).replace("frame_period", "exposures")
+        part = f"1/{round(period / step)} of the control period of {period:.6g} s"
+        remark(f"{named}: rounded to multiples of {1e3 * step:.6g} ms, {part}")
+    for name in odd:
+        if name not in far or name != "frame_period":
+            times[name] = round(times[name] / step) * step
+    if odd:
+        sensing = replace(sensing, latency=times["latency"], frame_period=times["frame_period"])
+    return times["command_delay"], sensing
+
+
+def _is_multiple(value: float, step: float, tolerance: float = TIME_TOLERANCE) -> bool:
+    return abs(round(value / step) * step - value) < tolerance
 
 
 class Frame(NamedTuple):
@@ -382,7 +415,7 @@ def build_bench(
         sensing: noise, latency, frame period and lost frames.
 
     Raises:
-        ValueError: times without a common sub-step, or arguments that `make` refuses.
+        ValueError: a control period that is not positive, or arguments that `make` refuses.
     """
     step = common_step(setup.period, command_delay, sensing)
     try:
@@ -391,4 +424,5 @@ def build_bench(
         if step == setup.period:
             raise
         raise ValueError(f"in sub-steps of {step:g} s, which the delays and the period need: {error}") from error
+    command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
     return Bench(world, command_delay, sensing, setup.period, None if setup.model is None else setup.model.camera)

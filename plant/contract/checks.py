@@ -79,3 +79,8 @@ def whole_steps(period: float, own_step: float) -> int:
             f"the nearest is {max(count, 1) * own_step:.9g} s"
         )
     return count
+
+
+def fewest_parts(period: float, longest: float) -> int:
+    """Return the least number of equal parts of a period [s], none longer than `longest` [s] by more than rounding."""
+    return max(1, math.ceil(period / longest - 1e-6))

@@ -50,7 +50,7 @@ class SensingConfig:
     """[m or px] standard deviation σ of the noise of each component, such as 1mm or 2px; of pixels in metres, their
     size in the planned image."""
     latency: Delay = 0.0
-    """[s] between exposure and delivery of a frame; a multiple of the control period, or whole milliseconds."""
+    """[s] between exposure and delivery of a frame; rounded by 0.5 ms at most where the control period needs it."""
     drop_probability: ShareBelowOne = 0.0
     """[1] chance that a frame is lost, independently of the others."""
     noise_factor: Annotated[NonNegative, Usual(20.0)] = 1.0

@@ -51,7 +51,7 @@ class FmuConfig:
     """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
 
     command_delay: Delay = 0.05
-    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
+    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
     isolate: bool = True

@@ -168,7 +168,7 @@ class BulletScene(Scene):
 
 
 class BulletSimulation(Simulation):
-    """The cascade of `servobench.plant.rendered.drives`, stepped at 1 kHz on PyBullet's rigid bodies."""
+    """The cascade of `servobench.plant.rendered.drives`, stepped at 1 kHz or faster on PyBullet's rigid bodies."""
 
     def __init__(self, machine: Machine) -> None:
         """Open a world without visual shapes and load the arm twice, with the true and with the assumed load.
@@ -188,7 +188,7 @@ class BulletSimulation(Simulation):
             self._boxes = {self._load(boxes_urdf((box,))): box.name for box in room}
             start = machine.start.tolist()
             inertia = np.array(pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=self._world.client))
-            self._drives = Drives(drives, machine.lag, inertia, machine.stops)
+            self._drives = Drives(drives, machine.lag, inertia, machine.stops, physics_step=machine.physics_step)
         except BaseException:
             self.close()
             raise

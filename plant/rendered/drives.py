@@ -1,6 +1,6 @@
 """The joints' drives: a cascade of position and velocity loops, torque limits, friction and reflected rotor inertia.
 
-A commanded velocity u is smoothed by a first-order lag and integrated to a reference; with h = 1 ms, in every step
+A commanded velocity u is smoothed by a first-order lag and integrated to a reference; in every step h of 1 ms or less
 
     c ← c + (1 − e^(−h/τ)) (u − c),      r ← r + h c                        reference
     e = c + K_p (r − θ) − ω                                                 velocity error
@@ -27,7 +27,7 @@ from servobench.plant.rendered.settings import DriveConfig
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 Arrays: TypeAlias = tuple[FloatArray, ...]
-PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
+PHYSICS_STEP = 0.001  # [s] where it divides the time to simulate, which otherwise has equal steps that are not longer
 # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
 POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
@@ -88,7 +88,13 @@ class Drives:
     """
 
     def __init__(
-        self, config: DriveConfig, lag: float, assumed_inertia: FloatArray, stops: Arrays, body: Arrays | None = None
+        self,
+        config: DriveConfig,
+        lag: float,
+        assumed_inertia: FloatArray,
+        stops: Arrays,
+        body: Arrays | None = None,
+        physics_step: float = PHYSICS_STEP,
     ) -> None:
         """Compute the gains.
 
@@ -98,8 +104,10 @@ class Drives:
             assumed_inertia: (n, n) [kg m²] of the links and the assumed load at the start.
             stops: (n,) and (n,) [rad], lower and upper stop of the true angles.
             body: arrays of the engine to be taken as `angle`, `speed` and `assumed_gravity`; None for own ones.
+            physics_step: h [s].
         """
-        n, h = len(assumed_inertia), PHYSICS_STEP
+        n = len(assumed_inertia)
+        h = self._h = physics_step
         config.check(n)
         self._lower, self._upper = stops
         blend = np.array([-math.expm1(-h / lag) if lag > 0.0 else 1.0])
@@ -156,7 +164,8 @@ class Drives:
         """
         self.assumed_gravity[:] = body.assumed_gravity
         self.step()
-        h, inertia = PHYSICS_STEP, body.inertia + self._rotor
+        h = self._h
+        inertia = body.inertia + self._rotor
         momentum = inertia @ self.speed + h * (self.torque - body.bias)
         inertia[self._diagonal] += self.drag
         speed = dposv(inertia, momentum)[1]
@@ -191,7 +200,7 @@ class Drives:
         `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would then simplify the sum.
         """
         c = c + blend * (u - c)
-        wanted = r + PHYSICS_STEP * c
+        wanted = r + self._h * c
         r = casadi.fmin(casadi.fmax(wanted, self._lower), self._upper)
         return r, casadi.if_else(r == wanted, c, 0.0)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray, Window
-from servobench.plant.rendered.drives import DriveState
+from servobench.plant.rendered.drives import PHYSICS_STEP, DriveState
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import Box, DriveConfig
 from servobench.plant.robot.arm import SerialArm
@@ -67,6 +67,7 @@ class Machine:
     lag: float  # [s] by which the drives smooth commanded velocities, 0 for none
     start: FloatArray  # (n,) [rad], joint angles at which the loops are tuned
     stops: tuple[FloatArray, FloatArray]  # (n,) and (n,) [rad], lower and upper stop of the joint angles
+    physics_step: float = PHYSICS_STEP  # [s]
 
 
 class Overlap(NamedTuple):
@@ -90,7 +91,7 @@ class Simulation(ABC):
         Args:
             joints: the present state.
             speed: (n,) [rad/s], commanded, of the joint angles.
-            steps: how many steps of `PHYSICS_STEP`.
+            steps: how many steps of the machine's `physics_step`.
         """
 
     @abstractmethod

@@ -266,7 +266,8 @@ class MujocoSimulation(Simulation):
         self._shapes, self._boxes = _solid(machine)
         self._placed, self._bodies = mujoco.MjData(self._shapes), self._shapes.geom_bodyid.tolist()
         body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
-        self._drives = Drives(drives, machine.lag, _assumed_inertia(machine), machine.stops, body)
+        inertia = _assumed_inertia(machine)
+        self._drives = Drives(drives, machine.lag, inertia, machine.stops, body, machine.physics_step)
 
     def start(self, angle: FloatArray) -> DriveState:
         """See `Simulation.start`."""
@@ -314,7 +315,8 @@ def _moving(machine: Machine) -> Any:  # noqa: ANN401
     drives = machine.drives
     spec = read_urdf(arm_mechanics(machine.arm, drives.payload, shapes=False, robot=machine.robot))
     option = spec.option
-    option.timestep, option.gravity = PHYSICS_STEP, (0.0, 0.0, -GRAVITY)
+    option.timestep = machine.physics_step
+    option.gravity = (0.0, 0.0, -GRAVITY)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # Joints that are not finite have to be detected.
     for joint, lower, upper in zip(spec.joints, *machine.stops, strict=True):

@@ -112,7 +112,7 @@ class RenderedConfig:
     obstacles: tuple[BoxNumbers, ...] = ()
     """[m] boxes that hide the ball and stand in the way: x, y, z of the centre in the base frame, and three sides."""
     command_delay: Delay = 0.0
-    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
+    """[s] between a command and its first effect; rounded by 0.5 ms at most where the control period needs it."""
     sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
     depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"

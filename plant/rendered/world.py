@@ -1,13 +1,14 @@
 """The world of a rendered plant: an arm with dynamics, and cameras in whose rendered images the target is detected.
 
 A physics engine (`servobench.plant.rendered.engine`) moves the arm under the drives of
-`servobench.plant.rendered.drives`, at 1 kHz, and renders it. Controllers get and command reported positions q, which
-are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link that meets another one, the table, the floor
-or an obstacle ends the run. Features are measured by `servobench.plant.rendered.detectors`. Delay, latency and lost
-frames are those of `servobench.plant.bench.bench`.
+`servobench.plant.rendered.drives`, at 1 kHz or slightly faster, and renders it. Controllers get and command reported
+positions q, which are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link that meets another one,
+the table, the floor or an obstacle ends the run. Features are measured by `servobench.plant.rendered.detectors`.
+Delay, latency and lost frames are those of `servobench.plant.bench.bench`.
 """
 
 import copy
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 
 from servobench.plant.bench.plant import PlantSetup, World
 from servobench.plant.cameras.setups import SetupModel
-from servobench.plant.contract.checks import FloatArray, as_array, whole_steps
+from servobench.plant.contract.checks import FloatArray, as_array, fewest_parts
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
@@ -86,8 +87,8 @@ class RenderedWorld(World):
         """Open a scene and a simulation with the arm.
 
         Raises:
-            ValueError: a start of the wrong size, a period that physics steps do not divide, a list that does not
-                fit the joints, a gear ratio of 0, or a window without a display.
+            ValueError: a start of the wrong size, a list that does not fit the joints, a gear ratio of 0, or a window
+                without a display.
         """
         model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
@@ -97,7 +98,10 @@ class RenderedWorld(World):
         if any(sensing.extents(self.spec.feature.unit)[each] for each in (0, 2)) or sensing.outliers > 0.0:
             self.noise_unit = model.noise_unit  # without noise, features keep their bits
         self._start = as_array("start", start, (self.spec.n,))
-        self._steps = whole_steps(setup.period, PHYSICS_STEP)
+        self._steps = fewest_parts(setup.period, PHYSICS_STEP)
+        self._physics_step = PHYSICS_STEP
+        if not math.isclose(self._steps * PHYSICS_STEP, setup.period, rel_tol=0.0, abs_tol=1e-9):
+            self._physics_step = setup.period / self._steps
         if not arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")
         self._camera = model.camera
@@ -110,7 +114,8 @@ class RenderedWorld(World):
         angle = arm.joint_angle(self._start)
         try:
             self._detector = open_detector(model, self._scene, config, robot)
-            self._simulation = engine.simulation(Machine(arm, robot, boxes, config.drives, config.lag, angle, ordered))
+            machine = Machine(arm, robot, boxes, config.drives, config.lag, angle, ordered, self._physics_step)
+            self._simulation = engine.simulation(machine)
         except BaseException:
             self._scene.close()
             raise
@@ -155,7 +160,7 @@ class RenderedWorld(World):
     def _check_contact(self, step: int) -> None:
         touching = self._contacts.find(self._joints.angle)
         if touching is not None:
-            seconds = self._periods * self.spec.period + step * PHYSICS_STEP
+            seconds = self._periods * self.spec.period + step * self._physics_step
             raise Collision(f"{touching[0]} meets {touching[1]} at {seconds:.3f} s")
 
     def see(self) -> FloatArray | None:

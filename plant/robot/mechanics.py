@@ -14,7 +14,7 @@ from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray, fewest_parts
 from servobench.plant.contract.sensing import ANGLE, NUMBER, SensorAxis
 from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, Usual, settings
 from servobench.plant.robot.hand_eye import FEATURE, RobotModel
@@ -62,7 +62,7 @@ class MechanicsConfig:
     def parts(self, period: float) -> int:
         """Return in how many parts a period [s] is integrated."""
         off = self.tool_frequency == 0.0 and self.backlash == 0.0
-        return 1 if off else max(1, math.ceil(period / MAX_PART - 1e-9))
+        return 1 if off else fewest_parts(period, MAX_PART)
 
     def transmitted(self, q: FloatArray) -> FloatArray:
         """Return g, (..., n) rad."""

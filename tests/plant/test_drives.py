@@ -23,8 +23,8 @@ def body(bias=(0.0, 0.0), assumed=(0.0, 0.0)) -> RigidBody:
     return RigidBody(INERTIA.copy(), np.array(bias), np.array(assumed))
 
 
-def drives(config=FREE, lag=0.0, stops=WIDE) -> Drives:
-    return Drives(config, lag, INERTIA, stops)
+def drives(config=FREE, lag=0.0, stops=WIDE, step=PHYSICS_STEP) -> Drives:
+    return Drives(config, lag, INERTIA, stops, physics_step=step)
 
 
 def run(joints: Drives, state: DriveState, command, steps, load=body) -> DriveState:
@@ -34,10 +34,11 @@ def run(joints: Drives, state: DriveState, command, steps, load=body) -> DriveSt
     return joints.give()
 
 
-def test_the_first_step_is_that_of_the_equations():
-    joints, command = drives(), np.array([0.3, 0.0])
+@pytest.mark.parametrize("h", [PHYSICS_STEP, 1.0 / 30.0 / 34.0])
+def test_the_first_step_is_that_of_the_equations(h):
+    joints, command = drives(step=h), np.array([0.3, 0.0])
     state = run(joints, joints.start(np.zeros(2), body()), command, 1)
-    h, pole = PHYSICS_STEP, 2 * np.pi * 2.0
+    pole = 2 * np.pi * 2.0
     reference = h * command
     error = command + pole / 4 * reference
     torque = pole * (np.array([1.5, 0.5]) + 0.5) * error
@@ -46,12 +47,13 @@ def test_the_first_step_is_that_of_the_equations():
     np.testing.assert_allclose(state.integral, h * pole / 10 * torque, rtol=1e-12)
 
 
-def test_the_reference_is_the_first_order_lag_of_the_command():
-    joints, decay, command = drives(lag=0.08), np.exp(-PHYSICS_STEP / 0.08), np.array([0.4, -0.2])
+@pytest.mark.parametrize("h", [PHYSICS_STEP, 1.0 / 30.0 / 34.0])
+def test_the_reference_is_the_first_order_lag_of_the_command(h):
+    joints, decay, command = drives(lag=0.08, step=h), np.exp(-h / 0.08), np.array([0.4, -0.2])
     joints.take(joints.start(np.zeros(2), body()), command)
     for k in range(1, 40):
         joints.track()
-        moved = PHYSICS_STEP * (k - decay * (1 - decay**k) / (1 - decay))
+        moved = h * (k - decay * (1 - decay**k) / (1 - decay))
         np.testing.assert_allclose(joints.angle, command * moved, atol=1e-14)
 
 

@@ -9,10 +9,12 @@ from kit.plants import NEEDS_BULLET, configure, setup
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.bench import Bench, common_step
 from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 
 RATES = (10, 20, 50, 125, 250)  # [Hz]
+CAMERA_RATES = (15, 30, 60, 90, 120)  # [Hz] whose periods are no whole milliseconds
 DURATION = 1.0  # [s]
 COMMON = 0.2  # [s] multiples of it are control instants at every rate
 QUIET = {"feature_noise": 0.0}
@@ -55,7 +57,7 @@ def every(seen, rate):
 @pytest.mark.parametrize("command_delay", [0.0, 0.05, 0.07])
 def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
     settings = {"command_delay": command_delay, "latency": 0.07}
-    walks = {rate: every(run(build(rate, **settings), rate), rate) for rate in RATES}
+    walks = {rate: every(run(build(rate, **settings), rate), rate) for rate in (*RATES, *CAMERA_RATES)}
     assert np.ptp(walks[250][0], axis=0).max() > 0.05
     for joints, features in walks.values():
         np.testing.assert_allclose(joints, walks[250][0], rtol=0.0, atol=1e-9)
@@ -130,24 +132,52 @@ def test_no_frame_is_taken_that_is_not_exposed(monkeypatch):
         (0.02, 0.05, SensingConfig(), 0.01),
         (0.008, 0.05, SensingConfig(latency=0.1), 0.002),
         (0.004, 0.05, SensingConfig(frame_period=0.033), 0.001),
+        (1 / 30, 0.05, SensingConfig(latency=0.1), 1 / 60),
+        (0.0333333, 0.05, SensingConfig(latency=0.1), 0.0333333 / 2),
+        (1 / 90, 0.05, SensingConfig(), 1 / 180),
+        (0.05, 0.05, SensingConfig(frame_period=1 / 30), 0.05 / 3),
+        (0.05, 0.0, SensingConfig(latency=0.0205), 0.0005),
+        (1 / 29.97, 0.05, SensingConfig(), 1 / 29.97 / 34),
+        (0.05, 0.083, SensingConfig(frame_period=1 / 29.97), 0.001),
     ],
 )
 def test_the_sub_step_is_the_greatest_common_divisor(period, delay, sensing, step):
     assert common_step(period, delay, sensing) == step
 
 
-@pytest.mark.parametrize(
-    ("period", "delay", "sensing", "message"),
-    [
-        (0.05, 0.0, SensingConfig(latency=0.0205), "latency must be a whole number of milliseconds"),
-        (1 / 240, 0.051, SensingConfig(), "period must be a whole number of milliseconds, because command_delay is no"),
-        (0.05, 0.05, SensingConfig(frame_period=1 / 30), "frame_period must be a whole number of milliseconds"),
-        (0.0, 0.05, SensingConfig(), "period must be above 0, got 0.0"),
-    ],
-)
-def test_times_without_a_common_sub_step_are_refused(period, delay, sensing, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        common_step(period, delay, sensing)
+def test_a_control_period_of_nothing_is_refused():
+    with pytest.raises(ValueError, match=re.escape("period must be above 0, got 0.0")):
+        common_step(0.0, 0.05, SensingConfig())
+
+
+@pytest.mark.parametrize("rate", [6, 24, 29.97, 48, 1000 / 3])
+def test_a_command_acts_after_its_delay_to_within_half_a_millisecond(rate):
+    world = configure(KinematicConfig, lag=0.0, command_delay=0.05, latency=0.083, **QUIET)
+    plant = find_plant("kinematic").build(world, setup(period=1 / rate))
+    start = plant.reset(3).joint_position
+    for _ in range(round(rate)):
+        seen = plant.step(Command(np.full(6, 0.3)))
+    np.testing.assert_allclose(seen.time - (seen.joint_position - start) / 0.3, 0.05, atol=0.0005)
+
+
+@pytest.mark.parametrize(("rate", "frames"), [(125, 30), (60, 30), (20, 29.97), (20, 15), (30, 24), (1000 / 3, 29.97)])
+def test_a_camera_keeps_its_own_rate_under_every_control_rate(monkeypatch, rate, frames):
+    taken, see = [], KinematicWorld.see
+    monkeypatch.setattr(KinematicWorld, "see", lambda world: taken.append(1) or see(world))
+    config = configure(KinematicConfig, command_delay=0.05, latency=0.083, frame_period=1 / frames, **QUIET)
+    plant = find_plant("kinematic").build(config, setup(period=1 / rate))
+    plant.reset(3)
+    for _ in range(round(20 * rate)):
+        plant.step(Command(np.zeros(6)))
+    assert abs(len(taken) - 1 - 20 * frames) <= 1
+
+
+def test_rounded_times_are_named_once(caplog):
+    remark.cache_clear()
+    for _ in range(2):
+        find_plant("kinematic").build(configure(KinematicConfig, command_delay=0.05, **QUIET), setup(period=1 / 29.97))
+    said = "command_delay: rounded to multiples of 0.981374 ms, 1/34 of the control period of 0.0333667 s"
+    assert [said in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_a_bench_refuses_a_world_that_is_too_coarse():
