@@ -34,6 +34,7 @@ MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a 
 MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
 MAX_MOVED: Final = 0.5  # share of its distance from the middle by which a distortion usually moves a point
 MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
+IN_STEP: Final = 2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in files of ROS and OpenCV
     "width": ("image_width", "width"),
@@ -175,18 +176,19 @@ class OwnCamera:
 def frame_time(what: str, rate: float, period: float) -> float:
     """Return how long a frame of a camera with a rate [Hz] takes on the bench [s].
 
-    It is a multiple of the control `period` [s], or else whole milliseconds; where two or more are delivered in each
-    period, one arrives at every control instant: 0.
+    It is a multiple of the control `period` [s] where the two are nearly in step, and else that of the rate; where two
+    or more are delivered in each period, one arrives at every control instant: 0.
     """
     frames, whole = rate * period, max(1, round(1e3 / rate)) / 1e3
     if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
         return 0.0
-    if abs(max(1, round(1.0 / frames)) * frames - 1.0) < 1e-5:
+    if abs(max(1, round(1.0 / frames)) * frames - 1.0) < IN_STEP:
         return round(1.0 / frames) * period
-    if abs(round(whole / period) * period - whole) > ROUNDED * period:
-        clocks = f"a frame takes {1e3 * whole:g} ms and a control period {1e3 * period:g} ms"
-        remark(f"{what}: {clocks}, so delays change; run.period={1e3 * whole:g}ms helps")
-    return whole
+    if abs(round(whole / period) * period - whole) <= ROUNDED * period:
+        return whole
+    clocks = f"a frame takes {1e3 / rate:g} ms and a control period {1e3 * period:g} ms"
+    remark(f"{what}: {clocks}, so delays change; run.period={rate:.9g}Hz helps")
+    return 1.0 / rate
 
 
 def read_camera(path: Path, *, second: bool = False) -> OwnCamera:

@@ -55,7 +55,7 @@ def test_features_are_in_its_image_and_change_at_its_rate():
     assert (
         max(u.max() - 320, 320 - u.min()) > 160 or max(v.max() - 240, 240 - v.min()) > 120
     )  # beyond the bench's image
-    frames = (result.steps["time_s"] / 0.067 + 1e-9).astype(int).diff().iloc[1:].to_numpy() > 0
+    frames = (15.0 * result.steps["time_s"] + 1e-9).astype(int).diff().iloc[1:].to_numpy() > 0
     np.testing.assert_array_equal(u.diff().iloc[1:].to_numpy() != 0.0, frames)
 
 
@@ -90,7 +90,7 @@ def test_a_folder_tells_its_camera():
     package.compare(["constant"], tasks=["random"], out="out", **asked)
     manifest = read_manifest(Path("out"))
     assert manifest["robots"][0]["camera"]["pose"]["position"] == [0.0, -0.07, 0.05]
-    assert manifest["configuration"]["kinematic"]["sensing.frame_period"] == 0.067
+    assert manifest["configuration"]["kinematic"]["sensing.frame_period"] == 1.0 / 15.0
 
 
 def test_a_run_is_shown_through_its_camera():

@@ -77,7 +77,7 @@ def test_the_plant_has_the_times_and_the_noise_of_the_twin(twin):
     assert resolve(request(twin), Settings()).plant.command_delay == 0.02
 
 
-@pytest.mark.parametrize(("rate", "frame_period"), [(20.0, 0.0), (10.0, 0.1), (15.0, 0.067), (40.0, 0.0)])
+@pytest.mark.parametrize(("rate", "frame_period"), [(20.0, 0.0), (10.0, 0.1), (15.0, 1.0 / 15.0), (40.0, 0.0)])
 def test_frames_at_the_control_rate_are_as_late_as_the_log_says(tmp_path, rate, frame_period):
     """A grid of frames would round the latency of 83 ms up to the next control instant."""
     robot = written(tmp_path, TWIN.replace("latency = 0.083", f"latency = 0.083\nrate = {rate}"))
