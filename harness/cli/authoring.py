@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import keyword
+import math
 import os
 import re
 import sys
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 TEMPLATES: Final = "servobench.harness.cli"
 IDENTIFYING: Final = "constant"  # a controller, which identification does not run
+PERIOD_TOLERANCE: Final = 1e-4  # [1] within which a logged period is one that is easier to write
 PREFIX: Final = "test_"
 NEXT: Final = {  # kind of a new file -> the next commands
     "controller": ("check {}", "run --controller {} --plant kinematic"),
@@ -209,10 +211,19 @@ def identify(
             )
             text = twin_text(found, rows, response, (named, request.sensing))
             write_atomically(out, lambda path: path.write_text(text, encoding="utf-8"))
-        period = max(round(resolved.run.period, 3), 0.001)  # as delays of a twin are no multiples of any other
-        clock = f" --set run.period={period:g}" * (period != RunSettings.period)
-        next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic{clock}"
+        next_one = f"servobench compare --robot {quote(str(out))} --plants kinematic"
+        if abs(resolved.run.period - RunSettings.period) > PERIOD_TOLERANCE * RunSettings.period:
+            next_one += f" --set run.period={_as_clock(resolved.run.period)}"
         say(f"twin in {out}; the next command: {next_one}")
+
+
+def _as_clock(period: float) -> str:
+    """Return a control period [s] as users write it: in whole milliseconds, as a rate in whole Hz, or as it is."""
+    if math.isclose(round(period, 3), period, rel_tol=PERIOD_TOLERANCE):
+        return f"{round(period, 3):g}"
+    if math.isclose(round(1.0 / period), 1.0 / period, rel_tol=PERIOD_TOLERANCE):
+        return f"{round(1.0 / period)}Hz"
+    return f"{period:.6g}"
 
 
 def _logged(

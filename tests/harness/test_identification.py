@@ -435,7 +435,7 @@ def test_a_twin_has_the_rate_and_the_latency_of_a_camera_that_is_no_multiple_of_
     robot = identify(log, find_robot("ur5e").nominal)
     twin = find_robot(str(write(tmp_path, twin_text(robot, log, None, ("ur5e", "position")), "twin.toml"))).twin
     given = twin.plant_settings(KinematicConfig(), 0.02)["sensing"]
-    assert given["frame_period"] == 0.066
+    assert given["frame_period"] == pytest.approx(0.066, rel=1e-3)
     assert given["latency"] == pytest.approx(0.08, abs=0.003)
     assert given["drop_probability"] == 0.0
 
@@ -494,7 +494,7 @@ def test_the_command_writes_a_twin_that_other_commands_take(output_of, tmp_path,
     table[::2].drop(columns=[name for name in table if name.startswith("true_")]).to_csv(log, index=False)
     told = output_of("identify", log, "--robot", "arm.urdf", "--out", out)
     assert "gear_elbow" in told
-    assert f"servobench compare --robot '{out}' --plants kinematic --set run.period=0.067\n" in told
+    assert f"servobench compare --robot '{out}' --plants kinematic --set run.period=15Hz\n" in told
     assert out.read_text(encoding="utf-8").startswith('robot = "../arm.urdf"')
     monkeypatch.chdir(out.parent)
     row = run("regression_mfac", task="exp2", robot=str(out), mismatch="none", settings={"exp2": {"duration": 3.0}}).row

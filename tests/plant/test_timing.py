@@ -12,6 +12,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
+from servobench.plant.rendered.settings import DriveConfig, RenderedConfig
 
 RATES = (10, 20, 50, 125, 250)  # [Hz]
 CAMERA_RATES = (15, 30, 60, 90, 120)  # [Hz] whose periods are no whole milliseconds
@@ -76,6 +77,17 @@ def test_the_rendered_world_is_the_same_at_two_rates():
     for one, other in zip(*walks, strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-9)
         assert np.ptp(one, axis=0).max() > 0.05
+
+
+@NEEDS_BULLET
+@pytest.mark.parametrize("rate", [15, 29.97, 30, 90])
+def test_physics_steps_add_up_to_the_period(rate):
+    config = configure(RenderedConfig, lag=0.0, latency=0.0, scenery=False, drives=DriveConfig(dynamics=False))
+    plant = find_plant("bullet").build(config, setup(period=1 / rate))
+    start = plant.reset(3).joint_position
+    moved = [plant.step(Command(np.full(6, 0.3))).joint_position - start for _ in range(3)]
+    plant.close()
+    np.testing.assert_allclose(moved[-1], 0.3 * 3 / rate, atol=config.encoder_resolution)
 
 
 @pytest.mark.parametrize("rate", RATES)
