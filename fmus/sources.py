@@ -187,7 +187,7 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry
         _objects(part["principal_point"], (c, 2)),
         _objects(part["distortion"], (c,)),
         view.size,
-        _objects(part["calibration"], (c, 6)) if view.calibrated else None,
+        _objects(part["calibration"], (c, view.calibration)) if view.calibration else None,
     )
     positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
     poses = [(symbolic_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 
 from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.optics import COLUMNS
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig
@@ -64,12 +65,16 @@ class View(NamedTuple):
     setup: SensingSetup  # the set-up
     mount: Mount  # of its cameras
     size: tuple[float, float]  # width and height of the images [px]
-    calibrated: bool  # whether the cameras have all coefficients of OpenCV's model and two focal lengths
+    calibration: int  # numbers of each camera in `Optics.further`; 0 for none
 
     @classmethod
     def of(cls, model: SetupModel) -> Self:
         """Return the view of an arm and its cameras."""
-        return cls(model.setup, model.mount, model.optics.size, model.optics.further is not None)
+        further = model.optics.further
+        numbers = 0
+        if further is not None:
+            numbers = further.shape[-1]
+        return cls(model.setup, model.mount, model.optics.size, numbers)
 
     @property
     def word(self) -> str:
@@ -87,7 +92,9 @@ class View(NamedTuple):
         on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
         middle = "Principal point, from the upper left corner of the image."
         turned = f"Roll, pitch and yaw of the cameras in the {on} frame."
-        further = "f_y/f_x, k2, p1, p2, k3 of OpenCV's model, and the largest squared tangent of a visible ray."
+        further = "f_y/f_x, k2, p1, p2, k3 of OpenCV's model, and the largest squared tangent of a visible ray"
+        last = {COLUMNS["rational_polynomial"]: ", and k4, k5, k6", COLUMNS["equidistant"]: ", and k4 of a fisheye"}
+        further += last.get(self.calibration, "") + "."
         return (
             Group("target", (p, 3), PARAMETER, "m", f"Points of the target in the {off} frame."),
             Group("camera_position", (c, 3), PARAMETER, "m", f"Cameras in the {on} frame."),
@@ -95,7 +102,7 @@ class View(NamedTuple):
             Group("focal_length", (c,), PARAMETER, "px", "Focal length of each camera."),
             Group("principal_point", (c, 2), PARAMETER, "px", middle),
             Group("distortion", (c,), PARAMETER, "1", "First coefficient of radial distortion."),
-            *([Group("calibration", (c, 6), PARAMETER, "1", further)] if self.calibrated else []),
+            *([Group("calibration", (c, self.calibration), PARAMETER, "1", further)] if self.calibration else []),
         )
 
     def outputs(self, n: int) -> tuple[Group, ...]:

@@ -11,7 +11,15 @@ focal length for each axis:
     (u, v) = c + (f_x b_x, f_y b_y)
     b = (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) a + (2 p₁ a_x a_y + p₂ (r² + 2 a_x²), p₁ (r² + 2 a_y²) + 2 p₂ a_x a_y)
 
-Beyond the r at which the radial polynomial turns back, a point would appear a second time: it is not in the image. All
+Its rational model (`CALIB_RATIONAL_MODEL`, Azure Kinect) divides the radial factor:
+
+    b = (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) / (1 + k₄ r² + k₅ r⁴ + k₆ r⁶) a + (…)
+
+and that of its fisheye module (Kannala and Brandt 2006; "equidistant" in ROS) is in the angle θ = arctan r of a ray:
+
+    b = θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸) / r a
+
+Beyond the r at which the length of b turns back, a point would appear a second time: it is not in the image. All
 functions take leading axes.
 """
 
@@ -27,6 +35,10 @@ from servobench.plant.robot.camera import PinholeCamera
 
 NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
+BISECTIONS: Final = 60  # from r = 1000 down to rounding
+AXIS: Final = 1e-24  # [1] added to r², so that a fisheye has a derivative on the optical axis
+# Columns of `Optics.further` by the model of the lens, under its name in ROS.
+COLUMNS: Final = {"plumb_bob": 6, "equidistant": 7, "rational_polynomial": 9}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +49,8 @@ class Optics:
     centre: FloatArray  # c, (..., c, 2) [px].
     distortion: FloatArray  # k or k₁, (..., c) [1].
     size: tuple[float, float]  # width and height of the images [px]
-    # f_y/f_x, k₂, p₁, p₂, k₃ and the largest r², (..., c, 6) [1], of calibrated cameras; None of others.
+    # f_y/f_x, k₂, p₁, p₂, k₃ and the largest r² [1] of calibrated cameras, (..., c, 6); None of others. The rational
+    # model has k₄, k₅, k₆ behind them, (..., c, 9), and the fisheye k₄, (..., c, 7), with p₁ = p₂ = 0.
     further: FloatArray | None = None
 
     @property
@@ -101,7 +114,9 @@ def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
     """
     bent = (pixels - optics.centre[..., None, :]) / optics.focal_lengths[..., None, :]
     a = bent
-    if optics.further is not None:
+    if optics.further is not None and optics.further.shape[-1] == COLUMNS["equidistant"]:
+        a = _flattened(bent, optics.distortion, optics.further)
+    elif optics.further is not None:
         a = _straightened(bent, optics.distortion, optics.further)
     elif optics.distortion.any():
         a = _undistorted(bent, optics.distortion[..., None])
@@ -122,10 +137,32 @@ def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def _radial(a: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatArray, ...]:
-    """Return r², 1 + k₁ r² + k₂ r⁴ + k₃ r⁶, its derivative by r², (..., c, p) each, and p₁ and p₂, (..., c, 1)."""
+    """Return r², the radial factor of a, its derivative by r², (..., c, p) each, and p₁ and p₂, (..., c, 1)."""
     k1, (k2, p1, p2, k3) = k1[..., None], (further[..., i, None] for i in range(1, 5))
     s = a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
-    return s, 1.0 + s * (k1 + s * (k2 + s * k3)), k1 + s * (2.0 * k2 + 3.0 * s * k3), p1, p2
+    if further.shape[-1] == COLUMNS["equidistant"]:
+        square = s + AXIS
+        r = np.sqrt(square)
+        angle, rate = _bent_angle(np.arctan(r), k1, further)
+        stretch = angle / r
+        return s, stretch, (rate / (1.0 + square) - stretch) / (2.0 * square), p1, p2
+    stretch = 1.0 + s * (k1 + s * (k2 + s * k3))
+    change = k1 + s * (2.0 * k2 + 3.0 * s * k3)
+    if further.shape[-1] == COLUMNS["rational_polynomial"]:
+        k4, k5, k6 = (further[..., i, None] for i in range(6, 9))
+        below = 1.0 + s * (k4 + s * (k5 + s * k6))
+        stretch = stretch / below
+        change = (change - stretch * (k4 + s * (2.0 * k5 + 3.0 * s * k6))) / below
+    return s, stretch, change, p1, p2
+
+
+def _bent_angle(angle: FloatArray, k1: FloatArray, further: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸) of a fisheye and its derivative by θ, (..., c, p) each."""
+    k2, k3, k4 = (further[..., i, None] for i in (1, 4, 6))
+    t = angle * angle
+    bent = angle * (1.0 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
+    rate = 1.0 + t * (3.0 * k1 + t * (5.0 * k2 + t * (7.0 * k3 + 9.0 * t * k4)))
+    return bent, rate
 
 
 def _bent(a: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
@@ -148,7 +185,11 @@ def _slope(a: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
 
 def _straightened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
     """Return a, (..., c, p, 2), of which b are the bent ones; Newton's method within the part that is visible."""
-    a, most = b, 0.95 * np.sqrt(further[..., 5, None])
+    edge = np.sqrt(further[..., 5, None])
+    a, most = b, 0.95 * edge
+    if further.shape[-1] == COLUMNS["rational_polynomial"]:
+        a = _radially_straightened(b, k1, further)
+        most = edge
     for _ in range(NEWTON_STEPS):
         (xx, xy), (_, yy) = np.moveaxis(_slope(a, k1, further), (-2, -1), (0, 1))
         e = _bent(a, k1, further) - b
@@ -156,6 +197,31 @@ def _straightened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatAr
         a = a - step / np.maximum(xx * yy - xy * xy, 1e-2)[..., None]
         a = a * np.minimum(1.0, most / np.maximum(norm(a), 1e-12))[..., None]
     return np.asarray(a)
+
+
+def _radially_straightened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
+    """Return a, (..., c, p, 2), of which b are the bent ones without tangential distortion; bisection of r."""
+    wanted = norm(b)
+    low = np.zeros_like(wanted)
+    high = low + np.sqrt(further[..., 5, None])
+    for _ in range(BISECTIONS):
+        r = 0.5 * (low + high)
+        _, factor, *_ = _radial(np.stack([r, np.zeros_like(r)], axis=-1), k1, further)
+        short = r * factor < wanted
+        low = np.where(short, r, low)
+        high = np.where(short, high, r)
+    return np.asarray(b * (low / np.maximum(wanted, 1e-12))[..., None])
+
+
+def _flattened(b: FloatArray, k1: FloatArray, further: FloatArray) -> FloatArray:
+    """Return a, (..., c, p, 2), of which b are the bent ones of a fisheye; Newton's method on θ."""
+    wanted = norm(b)
+    most = np.arctan(np.sqrt(further[..., 5, None]))
+    angle = np.minimum(wanted, most)
+    for _ in range(NEWTON_STEPS):
+        bent, rate = _bent_angle(angle, k1[..., None], further)
+        angle = np.clip(angle - (bent - wanted) / np.maximum(rate, 1e-3), 0.0, most)
+    return np.asarray(b * (np.tan(angle) / np.maximum(wanted, 1e-12))[..., None])
 
 
 def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArray:

@@ -17,6 +17,7 @@ A camera of the user's is where its file says, and its deviations are drawn on t
 file does not place it, is on its optical axis with the arm at home, if it is on the hand.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from math import atan2, cos, radians, sin
@@ -24,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.cameras.optics import NEAR, Optics, ideal_optics
+from servobench.plant.cameras.optics import COLUMNS, NEAR, Optics, ideal_optics
 from servobench.plant.cameras.setups import Mount, SensingSetup, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
@@ -215,10 +216,28 @@ def _optics(setup: SensingSetup, robot: Robot, draws: CameraDraws) -> Optics:
     focal, centre, distortion, further = optics.focal, optics.centre, draws.distortion, None
     if robot.camera is not None and setup.unit == "px":
         own = [each for each in (robot.camera, robot.camera.second) if each is not None]
-        K, D = np.array([each.matrix for each in own]), np.array([each.distortion for each in own])
-        focal, centre, distortion = K[:, 0, 0], K[:, :2, 2], D[:, 0] + distortion
-        further = np.column_stack([K[:, 1, 1] / K[:, 0, 0], D[:, 1:], distortion])
-        further[:, 5] = [turning_point(k1, k2, k3) for k1, k2, k3 in zip(distortion, D[:, 1], D[:, 4], strict=True)]
-        if (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all():
+        K = np.array([each.matrix for each in own])
+        focal, centre = K[:, 0, 0], K[:, :2, 2]
+        distortion = np.array([each.distortion[0] for each in own]) + draws.distortion
+        further = _further(own, distortion)
+        if further.shape[1] == COLUMNS["plumb_bob"] and (further[:, :5] == (1.0, 0.0, 0.0, 0.0, 0.0)).all():
             further = None
     return Optics(focal * draws.focal, centre + draws.centre, distortion, optics.size, further)
+
+
+def _further(own: Sequence[OwnCamera], distortion: FloatArray) -> FloatArray:
+    """Return the further numbers of calibrated cameras, see `Optics.further`, with k₁ as drawn, (c,)."""
+    width = max(COLUMNS[each.lens] for each in own)
+    further = np.zeros((len(own), width))
+    for row, camera, k1 in zip(further, own, distortion.tolist(), strict=True):
+        _, *others = camera.distortion
+        if camera.lens == "equidistant":
+            k2, k3, k4 = others
+            row[:5] = 1.0, k2, 0.0, 0.0, k3
+            row[6] = k4
+        else:
+            row[1:5] = others[:4]
+            row[6 : 2 + len(others)] = others[4:]
+        row[0] = camera.matrix[1, 1] / camera.matrix[0, 0]
+        row[5] = turning_point((k1, *others))
+    return further

@@ -1,30 +1,44 @@
 """A user's camera and target from a file: image, intrinsics, place, timing and noise; an example is in own_robot.md.
 
-The file is a TOML with the keys of `CameraFile`, or the intrinsics alone: a `camera_info` of ROS or a file of OpenCV's
-`FileStorage`, which a TOML may also name as its `intrinsics`. Keys that it lacks are as on the bench.
+The file is a TOML with the keys of `CameraFile`, or the intrinsics alone: a YAML of a calibration tool, which a
+TOML may also name as its `intrinsics`. Keys that it lacks are as on the bench.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import configuration_errors
-from servobench.plant.contract.files import read_text, read_toml
+from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Number, Positive, Usual, nested, override, remark, settings
 from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.camera_formats import in_rows, plain_name, read_intrinsics
 
-COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3")  # of OpenCV, in its order
-MODELS: Final = ("plumb_bob", "rational_polynomial")  # ROS's names of this model; k4, k5 and k6 of the second are 0
+LENSES: Final[Mapping[str, tuple[str, ...]]] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+SYNONYMS: Final[Mapping[str, str]] = {  # names without capitals, blanks, hyphens and underscores -> that of ROS
+    **dict.fromkeys(("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "plumb_bob"),
+    **dict.fromkeys(("rationalpolynomial", "rational", "rationalmodel", "fullopencv"), "rational_polynomial"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kb", "kb4", "kb8"), "equidistant"),
+    **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), "equidistant"),
+    **dict.fromkeys(("", "opencv"), ""),
+    **dict.fromkeys(("none", "null", "no", "nodistortion", "undistorted", "rectified", "ideal"), "none"),
+    **dict.fromkeys(("pinhole", "perspective", "inversebrownconrady", "modifiedbrownconrady"), "none"),
+}
+WANTED: Final = ", or ".join(f"{lens} with {', '.join(names)}" for lens, names in LENSES.items())
 RANGES: Final = {  # of numbers: unit, least and largest
     "width": ("px", 16, 20_000), "height": ("px", 16, 20_000), "vertical_fov": ("deg", 2, 170),
     "rate": ("Hz", 0.5, 1000), "latency": ("s", 0, 5),
@@ -33,17 +47,12 @@ FOCAL: Final = (0.1, 30.0)  # least and largest focal length over the width of t
 MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a place
 MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
 MAX_MOVED: Final = 0.5  # share of its distance from the middle by which a distortion usually moves a point
+ENDLESS: Final = 1e6  # [1] r² of a ray that no image shows
+MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] of it from the optical axis
+ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
 MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
 IN_STEP: Final = 2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
-INTRINSICS: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names in files of ROS and OpenCV
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-    "matrix": ("camera_matrix", "cameraMatrix", "k", "K"),
-    "distortion": ("distortion_coefficients", "distCoeffs", "dist_coeffs", "d", "D"),
-    "distortion_model": ("distortion_model",),
-}
-EXPONENT: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 Row = tuple[Number, ...]
 
 
@@ -121,8 +130,8 @@ class CameraFile:
     """[deg] in place of the matrix: square pixels about the middle of the image."""
     distortion: dict[str, Number] | Row = ()
     """Coefficients by name or in OpenCV's order."""
-    distortion_model: str = MODELS[0]
-    """By ROS's name."""
+    distortion_model: str = ""
+    """By ROS's name; empty for the model of OpenCV with as many coefficients."""
     rate: Positive | None = None
     """[Hz] of the frames."""
     latency: NonNegative | None = None
@@ -134,7 +143,7 @@ class CameraFile:
     target: Target = nested(Target)
     """Before the camera."""
     intrinsics: str = ""
-    """File beside this one, of ROS or OpenCV."""
+    """File beside this one, as calibration tools write it."""
     second: str = ""
     """File beside this one, of the second camera of a stereo pair."""
 
@@ -146,7 +155,8 @@ class OwnCamera:
     files: tuple[Path, ...]  # from which it was read, its own first
     keys: CameraFile  # of the file
     matrix: FloatArray  # (3, 3) [px], of intrinsics
-    distortion: tuple[float, ...]  # k1, k2, p1, p2, k3 [1]
+    lens: str  # a key of `LENSES`
+    distortion: tuple[float, ...]  # its coefficients [1]
     second: OwnCamera | None  # of a stereo pair; None for a single camera
 
     @property
@@ -211,55 +221,9 @@ def read_camera(path: Path, *, second: bool = False) -> OwnCamera:
                 raise ValueError(f"{twice[0]} is given here and by {keys.intrinsics}, its intrinsics; leave one out")
             keys = override(files[-1].name, keys, read)
         pair = read_camera(path.parent / keys.second, second=True) if keys.second else None
-        camera = OwnCamera((*files, *(pair.files if pair else ())), keys, _matrix(keys), _coefficients(keys), pair)
+        camera = OwnCamera((*files, *(pair.files if pair else ())), keys, _matrix(keys), *_lens(keys), pair)
         _check(camera)
     return camera
-
-
-def read_intrinsics(path: Path) -> dict[str, Any]:
-    """Return size, matrix and distortion of a `camera_info` of ROS or a file of OpenCV's `FileStorage`.
-
-    Raises:
-        ValueError: a file that cannot be read, or a key that is missing.
-    """
-    import yaml  # noqa: PLC0415 - few runs have such a file
-
-    class Loader(yaml.SafeLoader):
-        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05, which are texts in YAML 1.1."""
-
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+.0123456789"))
-    tag = "tag:yaml.org,2002:opencv-matrix"
-    Loader.add_constructor(tag, lambda loader, node: loader.construct_mapping(node, True))  # type: ignore[arg-type]
-    text = read_text("file", path)
-    if text.lstrip().startswith("<"):
-        raise ValueError(f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml")
-    try:
-        documents = yaml.load_all(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
-        found: Any = next(documents, None)  # `ros2 topic echo` puts --- after each message
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
-    keys = dict[str, Any]()
-    for key, names in INTRINSICS.items():
-        given = [found[name] for name in names if isinstance(found, dict) and name in found]
-        if not given and not key.startswith("distortion"):
-            raise ValueError(f"{path.name} has no {names[0]}")
-        for value in given[:1]:
-            keys[key] = value.get("data", []) if isinstance(value, dict) else value
-    roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
-    parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
-    full = 1, 1, keys["width"], keys["height"]
-    if found.get("fisheye_model"):
-        raise ValueError(f"{path.name} is of OpenCV's fisheye model; wanted {MODELS[0]} with {', '.join(COEFFICIENTS)}")
-    if any(part not in (None, 0, whole) for part, whole in zip(parts, full, strict=True)):
-        part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
-        raise ValueError(f"{path.name} is of a larger image, of which {part}")
-    return keys | {"matrix": in_rows(keys["matrix"])}
-
-
-def in_rows(value: Any) -> Any:  # noqa: ANN401 - a value of a file
-    """Return a list of nine numbers as three rows, and anything else as it is."""
-    flat = isinstance(value, list) and len(value) == 9
-    return [value[row : row + 3] for row in (0, 3, 6)] if flat else value
 
 
 def _matrix(keys: CameraFile) -> FloatArray:
@@ -290,41 +254,121 @@ def _matrix(keys: CameraFile) -> FloatArray:
     return K
 
 
-def _coefficients(keys: CameraFile) -> tuple[float, ...]:
-    """Return k1, k2, p1, p2 and k3."""
-    given, wanted = keys.distortion, f"{MODELS[0]} with {', '.join(COEFFICIENTS)}"
-    if keys.distortion_model not in MODELS:
-        raise ValueError(f"distortion_model {keys.distortion_model!r} is not known; wanted {wanted}")
+def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
+    """Return the model of the lens, a key of `LENSES`, and its coefficients."""
+    given = keys.distortion
+    values = tuple(given.values()) if isinstance(given, dict) else given
+    lens = SYNONYMS.get(plain_name(keys.distortion_model))
+    if lens is None:
+        raise ValueError(f"distortion_model {keys.distortion_model!r} is not known; wanted {WANTED}, or none")
+    if lens == "none" and any(values):
+        named = f"distortion_model {keys.distortion_model!r}"
+        raise ValueError(f"{named} must have no coefficients but 0, got {given}; wanted {WANTED}")
+    if lens in ("none", "plumb_bob", "rational_polynomial") and not any(values):
+        return "plumb_bob", (0.0, 0.0, 0.0, 0.0, 0.0)
     if isinstance(given, dict):
-        if unknown := sorted(set(given) - set(COEFFICIENTS)):
-            raise ValueError(f"distortion has no coefficient {unknown[0]!r}; wanted {wanted}")
-        given = tuple(given.get(name, 0.0) for name in COEFFICIENTS)
-    if len(given) in (1, 2, 3) or any(given[5:]):
-        raise ValueError(f"distortion must be {wanted}, got {given}")
-    return (*given[:5], 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+        return _named_coefficients(lens, given)
+    count = len(given)
+    if not lens:
+        if count == 4 and any(given):
+            remark('distortion of four numbers is k1, k2, p1, p2; of a fisheye, write distortion_model = "equidistant"')
+        lens = "rational_polynomial" if any(given[5:]) else "plumb_bob"
+    wanted = len(LENSES[lens])
+    whole = count >= wanted or not any(given[5:])
+    if not whole or any(given[wanted:]) or 0 < count < 4 or (lens == "equidistant" and not count):
+        raise ValueError(f"distortion must be of {lens} with {', '.join(LENSES[lens])}, got {given}; wanted {WANTED}")
+    return _least_lens(lens, (*given, *(0.0,) * wanted)[:wanted])
 
 
-def turning_point(k1: float, k2: float, k3: float) -> float:
-    """Return the least r² at which r (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) no longer grows; 1e6 where it always does."""
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tuple[float, ...]]:
+    """Return the model of the lens, empty where the file does not say it, and coefficients that are given by name."""
+    lens = lens or ("rational_polynomial" if {"k4", "k5", "k6"} <= set(given) else "plumb_bob")
+    if unknown := sorted(set(given) - set(LENSES[lens])):
+        raise ValueError(f"distortion has no coefficient {unknown[0]!r} in {lens}; wanted distortion_model {WANTED}")
+    return _least_lens(lens, tuple(given.get(name, 0.0) for name in LENSES[lens]))
+
+
+def _least_lens(lens: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """Return a lens of the rational model without denominator as one of the usual model."""
+    if lens == "rational_polynomial" and not any(coefficients[5:]):
+        return "plumb_bob", coefficients[:5]
+    return lens, coefficients
+
+
+def stretch(coefficients: Sequence[float], s: FloatArray) -> FloatArray:
+    """Return the factor by which a lens without tangential distortion moves points away from the middle.
+
+    Args:
+        coefficients: of one of `LENSES`.
+        s: r² [1], for a fisheye θ² [rad²].
+    """
+    if len(coefficients) == len(LENSES["equidistant"]):
+        k1, k2, k3, k4 = coefficients
+        return 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
+    k1, k2, _, _, k3, *others = coefficients
+    above = 1.0 + s * (k1 + s * (k2 + s * k3))
+    if not others:
+        return above
+    k4, k5, k6 = others
+    return np.asarray(above / (1.0 + s * (k4 + s * (k5 + s * k6))))
+
+
+def turning_point(coefficients: Sequence[float]) -> float:
+    """Return the least r² at which the image of a ray no longer moves away from the middle; 1e6 where it always does.
+
+    Args:
+        coefficients: of one of `LENSES`.
+    """
+    if len(coefficients) == len(LENSES["equidistant"]):
+        k1, k2, k3, k4 = coefficients
+        angle = math.sqrt(_least_root([9.0 * k4, 7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]))
+        return math.tan(min(angle, MAX_ANGLE)) ** 2
+    k1, k2, _, _, k3, *others = coefficients
+    rate = [7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]
+    if not any(others):
+        return _least_root(rate)
+    k4, k5, k6 = others
+    below = [k6, k5, k4, 1.0]
+    bent = np.polymul([2.0 * k3, 2.0 * k2, 2.0 * k1, 2.0], [3.0 * k6, 2.0 * k5, k4, 0.0])
+    return min(_least_root(below), _least_root(np.polysub(np.polymul(rate, below), bent)))
+
+
+def _least_root(polynomial: npt.ArrayLike) -> float:
+    """Return the least positive root of a polynomial; a million where it has none."""
+    roots = np.roots(polynomial)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(min(real, default=1e6))
+    return float(min(real, default=ENDLESS))
 
 
 def _check(camera: OwnCamera) -> None:
-    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    s, K, keys = turning_point(k1, k2, k3), camera.matrix, camera.keys
+    """Refuse a distortion by which no point appears in a corner of the image, and a pair that does not fit together.
+
+    The image of a fisheye may be a circle that does not reach the corners: of it the nearest border counts.
+    """
+    D, K, keys = camera.distortion, camera.matrix, camera.keys
     far = [max(K[i, 2], side - K[i, 2]) / K[i, i] for i, side in enumerate((keys.width, keys.height))]
-    if math.sqrt(s) * (1.0 + s * (k1 + s * (k2 + s * k3))) < math.hypot(*far):
+    fisheye = camera.lens == "equidistant"
+    turn = turning_point(D)
+    last = (1.0 - ROUNDED_ROOT) * turn
+    edge = math.hypot(*far)
+    tangential = 3.0 * math.hypot(*D[2:4])
+    if fisheye:
+        tangential = 0.0
+        edge = min(*far, MAX_ANGLE)
+        last = math.atan(math.sqrt(last)) ** 2
+    reach = math.sqrt(last) * float(stretch(D, np.array(last)))
+    if reach < edge and not (fisheye and turn >= ENDLESS):
         image = f"an image of {keys.width} × {keys.height} px before its corners, with this matrix"
-        raise ValueError(f"distortion {list(camera.distortion)} folds {image}; take them from one calibration")
-    squares = np.linspace(0.0, math.hypot(*far) ** 2)
-    radial, tangential = squares * (k1 + squares * (k2 + squares * k3)), 3.0 * math.hypot(p1, p2) * np.sqrt(squares)
-    if (moved := (np.abs(radial) + tangential).max()) > MAX_MOVED:
+        raise ValueError(f"distortion {list(D)} folds {image}; take them from one calibration")
+    squares = np.linspace(0.0, min(edge**2, last))
+    if (moved := (np.abs(stretch(D, squares) - 1.0) + tangential * np.sqrt(squares)).max()) > MAX_MOVED:
         much = f"moves points by {moved:.0%} of their distance from the middle; coefficients"
-        remark(f"distortion {list(camera.distortion)} {much} of OpenCV are no percent, and k1, k2, p1, p2, k3")
+        remark(f"distortion {list(D)} {much} of OpenCV are no percent, and {', '.join(LENSES[camera.lens])}")
     if camera.second is not None:
-        pair = [(each.width, each.height, each.pose.frame) for each in (keys, camera.second.keys)]
+        pair = [(each.keys.width, each.keys.height, each.keys.pose.frame) for each in (camera, camera.second)]
         if pair[0] != pair[1]:
             raise ValueError(f"{keys.second}, the second camera, must have the same width, height and pose.frame")
+        if fisheye != (camera.second.lens == "equidistant"):
+            raise ValueError(
+                f"{keys.second}, the second camera, must be a fisheye (equidistant) where the first is one"
+            )

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit import own
-from servobench.plant.cameras.optics import in_image, locate, project, project_rates
+from servobench.plant.cameras.optics import Optics, in_image, locate, project, project_rates
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
-from servobench.plant.robot.camera_file import read_camera
+from servobench.plant.robot.camera_file import read_camera, turning_point
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 
@@ -101,6 +101,59 @@ def test_a_pixel_is_found_again_and_beyond_the_fold_nothing_is_in_the_image(writ
     assert not in_image(folded, optics).any()
 
 
+WIDE = [[330.0, 0.0, 322.5], [0.0, 331.0, 238.0], [0.0, 0.0, 1.0]]
+LENSES = [
+    ("rational_polynomial", [1.2, 0.3, 0.0008, -0.0005, 0.01, 1.55, 0.65, 0.06]),
+    ("Rational Polynomial", [0.5378, -2.6486, 0.000537, -0.000307, 1.5349, 0.4155, -2.4699, 1.4627]),
+    ("equidistant", [0.0034, 0.0007, -0.002, 0.0002]),
+    ("Kannala_Brandt4", [-0.008, 0.045, -0.041, 0.008]),
+    ("fisheye", [0.0, 0.0, 0.0, 0.0]),
+]
+
+
+def wide_camera(lens, coefficients) -> str:
+    return f'width=640\nheight=480\nmatrix={WIDE}\ndistortion={coefficients}\ndistortion_model="{lens}"\n'
+
+
+@pytest.mark.parametrize(("lens", "coefficients"), LENSES)
+def test_wide_lenses_are_those_of_opencv_both_ways_over_the_whole_image(write, lens, coefficients):
+    model = Sensing.parse("pixel").nominal(robot_with(write(wide_camera(lens, coefficients))))
+    optics, q = model.optics, find_robot("ur10e").workspace.home
+    pixels = np.stack(np.meshgrid(np.linspace(0, 640, 33), np.linspace(0, 480, 25)), axis=-1).reshape(1, -1, 2)
+    points = locate(pixels, np.full(pixels.shape[:2], 1.3), optics)
+    of_opencv = cv2.projectPoints if len(coefficients) == 8 else cv2.fisheye.projectPoints
+    wanted, _ = of_opencv(points[0][:, None], np.zeros(3), np.zeros(3), np.array(WIDE), np.array(coefficients))
+    np.testing.assert_allclose(project(points, optics)[0], wanted[:, 0], atol=1e-9)
+    np.testing.assert_allclose(project(points, optics), pixels, atol=1e-9)
+    points = np.append(points, [[[0.0, 0.0, 1.0], [1e-13, 0.0, 2.0]]], axis=1)
+    step = 1e-6 * np.random.default_rng(2).standard_normal((*points.shape, 1))
+    rates = (project(points + step[..., 0], optics) - project(points - step[..., 0], optics)) / 2.0
+    np.testing.assert_allclose(project_rates(points, step, optics)[..., 0], rates, atol=1e-9)
+    function, x = symbolic_feature(model), casadi.SX.sym("q", 6)
+    y, J, _ = model.observe(q)
+    np.testing.assert_allclose(np.asarray(function(q))[:, 0], y, rtol=1e-12)
+    np.testing.assert_allclose(casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "last"),
+    [((0.0, -0.1, 0.0, 0.0), np.tan(np.sqrt(np.sqrt(2.0)))), ((0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),
+     ((0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0), 2.0)],
+)  # fmt: skip
+def test_a_wide_lens_shows_nothing_behind_its_fold_or_pole(coefficients, last):
+    # θ (1 − 0.1 θ⁴) turns back at θ⁴ = 2, r / (1 − r²/4) has a pole at r = 2 and r / (1 + r²/4) turns back there.
+    point = turning_point(coefficients)
+    assert np.sqrt(point) == pytest.approx(last, rel=1e-9)
+    k1, *others = coefficients
+    further = [1.0, *others[:4], point, *others[4:]]
+    if len(coefficients) == 4:
+        further = [1.0, others[0], 0.0, 0.0, others[1], point, others[2]]
+    size = (1e9, 1e9)
+    optics = Optics(np.ones(1), np.full((1, 2), 5e8), np.array([k1]), size, np.array([further]))
+    points = np.array([[[0.999 * last, 0.0, 1.0], [1.001 * last, 0.0, 1.0], [1e5, 0.0, 1.0]]])
+    np.testing.assert_array_equal(in_image(points, optics), [[True, False, False]])
+
+
 def test_mismatch_is_drawn_on_top_of_the_file(write):
     robot = robot_with(write(CAMERA + ABOVE))
     model = true_model(robot, "pixel", mismatch=Mismatch.parse("camera_rotation=20deg+focal=10%+centre=8px"))
@@ -149,6 +202,94 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
     assert read_camera(named).files == (named, tmp_path / "ros.yaml")
 
 
+ROWS = "rows: 3\n  cols: 3\n  dt: d\n  data: [615.0, 0.0, 322.5, 0.0, 617.0, 238.0, 0.0, 0.0, 1.0]\n"
+NUMBERS = "fx: 615.0\n  fy: 617.0\n  cx: 322.5\n  cy: 238.0\n"
+FISHEYE = (0.0034, 0.0007, -0.002, 0.0002)
+TOOLS = {
+    "opencv5": f"""%YAML 1.2\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: !!opencv-matrix\n  {ROWS}
+distortion_coefficients: !!opencv-nd-matrix\n  sizes: [ 5 ]\n  dt: d\n  data: {list(D)}\n""",
+    "autoware": f"%YAML:1.0\n---\nCameraMat: !!opencv-matrix\n  {ROWS}ImageSize: [ 640, 480 ]\n"
+    f"DistCoeff: !!opencv-matrix\n  {{rows: 1, cols: 5, dt: d, data: {list(D)}}}\nDistModel: Plumb-Bob\n",
+    "kalibr": "cam0:\n  camera_model: pinhole\n  intrinsics: [615.0, 617.0, 322.5, 238.0]\n  resolution: [640, 480]\n"
+    f"  distortion_coeffs: {list(FISHEYE)}\n  distortion_model: equidistant\n",
+    "vins": "%YAML:1.0\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: 480\ndistortion_parameters:\n"
+    f"  k1: 0.12\n  k2: -0.25\n  p1: 0.002\n  p2: -0.001\n  k3: 0.08\nprojection_parameters:\n  {NUMBERS}",
+    "vins_fisheye": "model_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\nprojection_parameters:\n"
+    "  {k2: 0.0034, k3: 0.0007, k4: -0.002, k5: 0.0002, mu: 615.0, mv: 617.0, u0: 322.5, v0: 238.0}\n",
+    "orb": "Camera.type: PinHole\nCamera.width: 640\nCamera.height: 480\nCamera.k1: 0.12\nCamera.k2: -0.25\n"
+    "Camera.p1: 0.002\nCamera.p2: -0.001\nCamera.k3: 0.08\n" + "".join(
+        f"Camera.{each.strip()}\n" for each in NUMBERS.splitlines()),
+    "orb3_fisheye": "Camera.type: KannalaBrandt8\nCamera.width: 640\nCamera.height: 480\nCamera1.k1: 0.0034\n"
+    "Camera1.k2: 0.0007\nCamera1.k3: -0.002\nCamera1.k4: 0.0002\n" + "".join(
+        f"Camera1.{each.strip()}\n" for each in NUMBERS.splitlines()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_files_of_calibration_tools_give_the_same_camera(write, tool):
+    camera = read_camera(write(TOOLS[tool], "tool.yaml"))
+    np.testing.assert_array_equal(camera.matrix, K)
+    assert (camera.keys.width, camera.keys.height) == (640, 480)
+    fisheye = tool in ("kalibr", "vins_fisheye", "orb3_fisheye")
+    assert (camera.lens, camera.distortion) == (("equidistant", FISHEYE) if fisheye else ("plumb_bob", D))
+
+
+BENT = "[0.12, -0.25, 0.002, -0.001, 0.08]"
+NO = "[0, 0, 0, 0, 0]"
+
+
+@pytest.mark.parametrize(
+    ("model", "data"),
+    [("''", "[]"), ("~", NO), ("none", "[0.0]"), ("None", "~"), ("pinhole", "[]"), ("Inverse Brown Conrady", NO),
+     ("modified_brown_conrady", NO), ("rational_polynomial", NO), ("plumb_bob", "[]"), ("radtan", "[[0], [0]]")],
+)  # fmt: skip
+def test_no_distortion_under_any_name_is_none(write, model, data):
+    text = ROS.replace("plumb_bob", model).replace(BENT, data)
+    assert read_camera(write(text, "ros.yaml")).distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("model", ["radtan", "Plumb Bob", "plumb-bob", "PLUMB_BOB", "Brown Conrady", "opencv"])
+def test_other_names_of_the_usual_model_are_known(write, model):
+    camera = read_camera(write(ROS.replace("plumb_bob", model), "ros.yaml"))
+    assert (camera.lens, camera.distortion) == ("plumb_bob", D)
+
+
+@pytest.mark.parametrize(
+    ("model", "data", "said"),
+    [
+        ("Inverse Brown Conrady", BENT, "'Inverse Brown Conrady' must have no coefficients but 0, got"),
+        ("''", BENT, "distortion_model 'none' must have no coefficients but 0"),
+        ("fov", "[0.9]", "distortion_model 'fov' is not known; wanted plumb_bob with k1, k2, p1, p2, k3, or rational"),
+        ("equidistant", "[0.1, 0.2]", "distortion must be of equidistant with k1, k2, k3, k4, got"),
+        ("equidistant", "[]", "distortion must be of equidistant with k1, k2, k3, k4, got"),
+        ("equidistant", BENT, "distortion must be of equidistant with k1, k2, k3, k4, got"),
+        (
+            "plumb_bob",
+            "[0.1, -0.2, 0, 0, 0, 0.1, 0, 0]",
+            "distortion must be of plumb_bob with k1, k2, p1, p2, k3, got",
+        ),
+        ("rational_polynomial", "[0.1, 0, 0, 0, 0, 0.1]", "distortion must be of rational_polynomial with k1"),
+        (
+            "rational_polynomial",
+            "[0.1, 0, 0, 0, 0, 0.1, 0, 0, 0.01, 0, 0, 0]",
+            "distortion must be of rational_polynom",
+        ),
+        ("plumb_bob", "{k1: 0.1, k4: 0.2}", "distortion has no coefficient 'k4' in plumb_bob"),
+    ],
+)
+def test_coefficients_that_are_not_those_of_their_model_are_refused(write, model, data, said):
+    text = ROS.replace("plumb_bob", model).replace("{rows: 1, cols: 5, data: " + BENT + "}", data)
+    with pytest.raises(ValueError, match=said):
+        read_camera(write(text, "ros.yaml"))
+
+
+def test_a_distortion_under_a_name_that_is_not_known_is_no_ideal_camera(write):
+    with pytest.raises(ValueError, match="ros.yaml has 'distortion'; wanted the name distortion_coefficients"):
+        read_camera(write(ROS.replace("distortion_coefficients", "distortion"), "ros.yaml"))
+    with pytest.raises(ValueError, match="distortion_model 'omni' is not known"):
+        read_camera(write(TOOLS["kalibr"].replace("pinhole", "omni"), "tool.yaml"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -163,8 +304,13 @@ def test_files_of_ros_and_opencv_give_the_same_camera(write, tmp_path):
             "-3.0",
             "folds an image of 640 × 480 px before its corners, with this matrix; take them from one calibration",
         ),
-        ("k3", "k4", "distortion has no coefficient 'k4'; wanted plumb_bob with k1, k2, p1, p2, k3"),
-        ("height", 'distortion_model = "fisheye"\nheight', "distortion_model 'fisheye' is not known; wanted plumb_bob"),
+        ("k3", "k4", "distortion has no coefficient 'k4' in plumb_bob; wanted distortion_model plumb_bob with k1, k2"),
+        (
+            "height",
+            'distortion_model = "omni"\nheight',
+            "distortion_model 'omni' is not known; wanted plumb_bob with k1",
+        ),
+        ("height", 'distortion_model = "equidistant"\nheight', "distortion has no coefficient 'p1' in equidistant"),
         ("[pose]", "vertical_fov = 60.0\n[pose]", "either matrix .px. or vertical_fov .deg. must be given, got both"),
         ("[pose]", "rate = 0.05\n[pose]", "rate must be given in Hz, from 0.5 to 1000, got 0.05"),
         ("[pose]", "latency = 80\n[pose]", "latency must be given in s, from 0 to 5, got 80"),

@@ -1,0 +1,163 @@
+"""Size, matrix and distortion of a camera in the YAML of calibration tools.
+
+`camera_info` of ROS, `FileStorage` of OpenCV, of which Autoware has other names, camera chains of kalibr, settings of
+VINS (camodocal), where the fisheye's k₁ … k₄ are k2 … k5, and those of ORB-SLAM, whose names begin with `Camera.`.
+"""
+
+import re
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+from servobench.plant.contract.files import read_text
+from servobench.plant.contract.settings import remark
+
+NAMES: Final[Mapping[str, tuple[str, ...]]] = {  # key -> its names
+    "width": ("image_width", "width", "w"),
+    "height": ("image_height", "height", "h"),
+    "matrix": ("camera_matrix", "cameraMatrix", "CameraMat", "k", "K"),
+    "distortion": (
+        "distortion_coefficients", "distCoeffs", "dist_coeffs", "DistCoeff", "distortion_coeffs", "d", "D",
+    ),
+    "distortion_model": ("distortion_model", "DistModel"),
+}  # fmt: skip
+SIZES: Final = ("ImageSize", "image_size", "resolution")  # width and height
+PROJECTIONS: Final = ("camera_model", "model_type", "Camera.type")
+PINHOLES: Final = ("pinhole", "pinholefull", "perspective", "opencv")  # projections with any distortion
+FOCAL_NAMES: Final = (("fx", "fy", "cx", "cy"), ("fl_x", "fl_y", "cx", "cy"), ("mu", "mv", "u0", "v0"))
+COEFFICIENTS: Final[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE: Final[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
+PARTS: Final = ("projection_parameters", "distortion_parameters")  # of VINS
+DISTORTION: Final = re.compile(r"dist(?!ance)", re.IGNORECASE)  # in names of keys
+EXPONENT: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+
+
+def plain_name(text: str) -> str:
+    """Return a name without capitals, blanks, hyphens and underscores."""
+    return re.sub(r"[\W_]+", "", text.lower())
+
+
+def read_intrinsics(path: Path) -> dict[str, Any]:
+    """Return size, matrix and distortion of a file, by the keys of `CameraFile`.
+
+    Raises:
+        ValueError: a file that cannot be read, or a key that is missing.
+    """
+    found = _parse(path)
+    if not isinstance(found, dict):
+        raise ValueError(f"{path.name} has no image_width")  # noqa: TRY004 - as of a mapping without it
+    found = _flat(_first_camera(path, found))
+    keys = dict[str, Any]()
+    for key, names in NAMES.items():
+        given = [found[name] for name in names if name in found]
+        if given:
+            keys[key] = _data(given[0])
+    _check_part(path, found, keys)
+    if any(name not in keys for name in ("width", "height", "matrix")):
+        lacking = next(name for name in ("width", "height", "matrix") if name not in keys)
+        raise ValueError(f"{path.name} has no {NAMES[lacking][0]}")
+    if "distortion" not in keys and (other := [name for name in found if _is_distortion(name)]):
+        raise ValueError(f"{path.name} has {other[0]!r}; wanted the name distortion_coefficients")
+    if "distortion_model" in keys:
+        keys["distortion_model"] = keys["distortion_model"] or "none"  # an empty one stands for none in ROS
+    projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
+    if projection and plain_name(projection) not in PINHOLES:
+        keys["distortion_model"] = projection
+    if found.get("fisheye_model"):
+        keys["distortion_model"] = "fisheye"
+    return keys | {"matrix": in_rows(keys["matrix"])}
+
+
+def in_rows(value: Any) -> Any:  # noqa: ANN401 - a value of a file
+    """Return a list of nine numbers as three rows, and anything else as it is."""
+    flat = isinstance(value, list) and len(value) == 9
+    return [value[row : row + 3] for row in (0, 3, 6)] if flat else value
+
+
+def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
+    """Return the first document of a YAML file."""
+    import yaml  # noqa: PLC0415 - few runs have such a file
+
+    class Loader(yaml.SafeLoader):
+        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05, which are texts in YAML 1.1."""
+
+    def mapping(loader: Any, node: Any) -> Any:  # noqa: ANN401 - PyYAML's
+        return loader.construct_mapping(node, deep=True)
+
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+.0123456789"))
+    for tag in ("opencv-matrix", "opencv-nd-matrix"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", mapping)
+    text = read_text("file", path)
+    if text.lstrip().startswith("<"):
+        raise ValueError(f"{path.name} is XML; wanted YAML, which OpenCV writes where the name ends in .yml")
+    try:
+        documents = yaml.load_all(text.partition("\n")[2] if text.startswith("%YAML") else text, Loader)
+        return next(documents, None)  # `ros2 topic echo` puts --- after each message
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path.name} is not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def _first_camera(path: Path, found: dict[Any, Any]) -> dict[Any, Any]:
+    """Return the first camera of a chain of kalibr, and the keys of any other file as they are."""
+    cameras = [name for name in found if re.fullmatch(r"cam\d+", str(name)) and isinstance(found[name], dict)]
+    if not cameras:
+        return found
+    if len(cameras) > 1:
+        remark(f"{path.name}: the camera {cameras[0]} of {', '.join(cameras)} is taken")
+    chosen: dict[Any, Any] = found[cameras[0]]
+    return chosen
+
+
+def _flat(found: dict[Any, Any]) -> dict[str, Any]:
+    """Return keys with those of VINS, kalibr and ORB-SLAM under the names of ROS, where a file has them."""
+    keys = {str(name): value for name, value in found.items()}
+    for name, value in list(keys.items()):
+        if name.startswith(("Camera.", "Camera1.")):
+            keys.setdefault(name.partition(".")[2], value)
+        if name in PARTS and isinstance(value, dict):
+            keys |= value
+    pair = [keys[name] for name in SIZES if name in keys]
+    if pair and isinstance(pair[0], list) and len(pair[0]) == 2:
+        keys["image_width"], keys["image_height"] = pair[0]
+    numbers = keys.get("intrinsics")
+    for names in FOCAL_NAMES:
+        if all(name in keys for name in names):
+            numbers = [keys[name] for name in names]
+    if isinstance(numbers, list) and len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        keys.setdefault("camera_matrix", [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+    given = {name: keys[name] for name in COEFFICIENTS if name in keys}
+    if "mu" in keys:
+        given = {name: keys.get(other, 0.0) for name, other in zip(FISHEYE, FISHEYE_OF_VINS, strict=True)}
+    if given and not any(name in keys for name in NAMES["distortion"]):
+        keys["distortion_coefficients"] = given
+    return keys
+
+
+def _is_distortion(name: str) -> bool:
+    known = (*NAMES["distortion_model"], *PARTS)
+    return name not in known and DISTORTION.search(name) is not None
+
+
+def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
+    """Return the numbers of a matrix as a flat list, and other values as they are."""
+    if isinstance(value, dict):
+        value = value.get("data", [] if "rows" in value or "sizes" in value else value)
+    if value is None:
+        return []
+    if isinstance(value, list):
+        rows = [row if isinstance(row, list) else [row] for row in value]
+        return list(chain.from_iterable(rows))
+    return value
+
+
+def _check_part(path: Path, found: Mapping[str, Any], keys: Mapping[str, Any]) -> None:
+    """Refuse a message of ROS about a part of a larger image."""
+    roi = found["roi"] if isinstance(found.get("roi"), dict) else {}
+    parts = found.get("binning_x"), found.get("binning_y"), roi.get("width"), roi.get("height")
+    full = 1, 1, keys.get("width"), keys.get("height")
+    if any(part not in (None, 0, whole) for part, whole in zip(parts, full, strict=True)):
+        part = "binning or a region (roi) leaves a part; write size and matrix of the image as it comes into a TOML"
+        raise ValueError(f"{path.name} is of a larger image, of which {part}")
