@@ -58,7 +58,8 @@ def describe_controllers(folder: Path) -> str:
     found: dict[str, list[str]] = {}
     for name in names if len(names) > 1 else ():
         values = configuration.get(name)
-        known = values is not None and not name.startswith(MAPPED)
+        place = manifest.get("own_controllers", {}).get(name, {}).get("place", name)
+        known = values is not None and not place.startswith(MAPPED)
         found.setdefault(describe_aids(values) if known else "aids unknown", []).append(name)
     return "; ".join(f"{words}: {', '.join(each)}" for words, each in found.items())
 

@@ -23,7 +23,7 @@ TABLES: Final = (".csv", ".parquet")  # suffixes
 MAX_PERIOD: Final = 2.0  # [s] between rows of a log
 TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
-CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.py(:|$)")  # in names of plants, controllers and set-ups
+CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.(?i:py)(:|$)")  # in names of plants, controllers and set-ups
 TASK: Final = "circle"  # likewise, without effect
 RENAMED: Final = {  # counts of control periods up to 0.2.0 -> times
     f"initial.{word}_periods": f"initial.{word}_time" for word in ("probe", "settle", "average")
@@ -122,7 +122,7 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
     Raises:
         ConfigurationError: a file that cannot be read, or a name that cannot be used.
     """
-    if path.suffix not in TABLES:
+    if path.suffix.lower() not in TABLES:
         raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(TABLES)}")
     table = read_table("log", path)
     request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, robot=robot, sensing=sensing)

@@ -13,12 +13,12 @@ from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import blas_libraries, installed_version, read_checkout
 from servobench.harness.config.registry import CONTROLLER_REGISTRY, MAPPED, PLANT_REGISTRY, Offer, find_plant
 from servobench.harness.config.settings import flatten
-from servobench.harness.config.source import PLACE, digest_of_module, neighbours
+from servobench.harness.config.source import digest_of_module, find_place, neighbours
 from servobench.harness.run.request import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.run.tasks import TASK_REGISTRY
 from servobench.plant.contract.checksums import digest
 from servobench.plant.contract.files import read_toml, user_path
-from servobench.plant.robot.catalogue import WITH
+from servobench.plant.robot.catalogue import read_word
 
 PACKAGES = (
     "servobench", "numpy", "scipy", "pandas", "pyarrow", "pybullet", "mujoco", "control", "casadi", "fmpy",
@@ -120,7 +120,8 @@ def named_files(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], ow
         own: controllers and plants of the user. A module that their file imports from its own folder is named as if the
             user had written it.
     """
-    found = {name: user_path(name) for name in _names(runs, configuration)}
+    own = tuple(own)
+    found = {name: user_path(name) for name in _names(runs, configuration, own)}
     for each in own:
         found |= {} if each.given or not each.file else _code(each.place, Path(each.file))
     for word in runs.sensings:
@@ -129,25 +130,25 @@ def named_files(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], ow
     return {name: digest(path) for name, path in found.items() if path.is_file()}
 
 
-def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _names(runs: Survey, configuration: Mapping[str, Mapping[str, Any]], own: Iterable[Offer]) -> Iterator[str]:
     """Yield the names that may be those of files without code."""
-    yield from (name.partition(WITH)[0].partition("#")[0] for name in runs.robots)
+    yield from (read_word(name).robot for name in runs.robots)
     for camera in (find_robot(name).camera for name in runs.robots):
         yield from () if camera is None else map(str, camera.files)
     yield from filter(None, (each.mismatch.calibration for each in runs.examples))
     for values in configuration.values():
         yield from (str(value) for key, value in values.items() if key.split(".")[-1] == "file" and value)
-    for name in (*runs.plants, *runs.controllers):
+    for name in (*runs.plants, *runs.controllers, *(each.place for each in own)):
         if name.startswith(MAPPED):
             path = name.removeprefix(MAPPED)
             yield path
-            if path.endswith(".toml"):
+            if path.lower().endswith(".toml"):
                 yield str(Path(path).parent / str(read_toml("mapping", user_path(path)).get("file", "")))
 
 
 def _code(place: str, file: Path) -> dict[str, Path]:
     """Return a file of code and the modules that it imports from its own folder, by their names from its place."""
-    found = PLACE.fullmatch(place)
+    found = find_place(place)
     if found is not None and found["module"]:
         deep = found["module"].count(".") + (file.name == "__init__.py")
         root, begin = file.parents[min(deep, len(file.parents) - 1)], Path()

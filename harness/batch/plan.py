@@ -23,7 +23,7 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunRequest, Value, Varied, read_mismatch
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import parse_toml
+from servobench.plant.contract.files import parse_toml, split_words
 from servobench.plant.contract.settings import listed
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
@@ -278,7 +278,7 @@ def parse_values(name: str, text: str) -> tuple[Value, ...]:
         try:
             values = parse_toml(f"values = [{text}]")["values"]
         except (ValueError, RecursionError):
-            words = [part.strip() for part in text.split(",")]
+            words = split_words(text)
             parts = [split_quantity(word) for word in words]
             values = [part[0] if part and not part[1] else word for part, word in zip(parts, words, strict=True)]
     numeric = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)

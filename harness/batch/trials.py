@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from servobench.harness.check.report import Finding
 from servobench.harness.config.registry import MAPPED, REGISTRIES, find_controller, installed_plant
-from servobench.harness.config.source import PLACE, count_as_users, place_in_trace
+from servobench.harness.config.source import count_as_users, find_place, place_in_trace
 from servobench.harness.run.result import LOST, TIMED_OUT, Ending
 from servobench.plant.contract.faults import ConfigurationError, FmuError, configuration_errors
 
@@ -120,7 +120,7 @@ def choose(word: Word, given: str) -> str:
         ConfigurationError: there is none, or it cannot be used; one line with file and line number.
     """
     registry = REGISTRIES[word]
-    place = None if given.startswith(MAPPED) or given in registry.names() else PLACE.fullmatch(given)
+    place = None if given.startswith(MAPPED) or given in registry.names() else find_place(given)
     if place is not None and place["module"]:
         count_as_users(place["module"])
     if place is not None or registry.published(given) is not None:

@@ -57,7 +57,7 @@ class Export:
 
 def check_output(output: Path, ending: str) -> None:
     """Raise ConfigurationError if the file to write has no folder, or does not end as importing tools expect it to."""
-    if output.suffix != ending:
+    if output.suffix.lower() != ending:
         raise ConfigurationError(f"--output must end in {ending}, got {output}")
     if not output.parent.is_dir():
         raise ConfigurationError(f"the folder {output.parent} for {output.name} does not exist")

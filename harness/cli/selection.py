@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servobench.harness.cli.terminal import say
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import split_words
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trials import Word
@@ -154,7 +155,7 @@ def split(kind: str, text: str, *, option: str = "", robot: str = "ur5") -> tupl
         return [each.name for each in found if not each.fault]
 
     chosen = split_names(option or kind, text, names.known(), names.find, usable)
-    _tell_unused(names, split_words(text))
+    _tell_unused(names, split_words(text, names.known()))
     return chosen
 
 
@@ -165,11 +166,6 @@ def _tell_unused(names: Names, named: Sequence[str]) -> None:
     for name, line in REGISTRIES[names.tried].unused_points() if names.tried else ():
         if name in named or ALL in named:
             sys.stderr.write(f"servobench: note: {line}\n")
-
-
-def split_words(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def split_names(
@@ -191,7 +187,7 @@ def split_names(
     from servobench.plant.contract.settings import suggest
 
     names: list[str] = []
-    for word in split_words(text):
+    for word in split_words(text, known):
         if word == ALL:
             names += known if usable is None else usable()
         elif find is not None or word in known:

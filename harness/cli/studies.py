@@ -13,6 +13,7 @@ from servobench.harness.cli.options import CHALLENGE, CONTROLLER, PLANT, option,
 from servobench.harness.cli.results import judge
 from servobench.harness.cli.terminal import FAILED, console, end_interrupted, print_rows, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError, RunFault, configuration_errors
+from servobench.plant.contract.files import split_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -95,7 +96,7 @@ def robustness(
     from servobench.harness.studies.robustness import BASE, TASK, find_lines, make_map
 
     settings = overrides.settings()
-    lines = find_lines(selection.split_words(axes))
+    lines = find_lines(split_words(axes))
     names = selection.split("controllers", controllers, robot=robot)
     where = selection.split("plants", plant, option="plant", robot=robot)[0]
     base = "none" if find_robot(robot).twin else BASE
@@ -135,7 +136,7 @@ def suite(
     from servobench.harness.studies.challenge import choose_challenges
     from servobench.harness.studies.suite import carry_out_suite, suite_tables
 
-    worlds = choose_challenges(selection.split("challenges", challenges), selection.split_words(grade))
+    worlds = choose_challenges(selection.split("challenges", challenges), split_words(grade))
     names = selection.split("controllers", controllers)
     where = selection.split("plants", plants) if plants else ()
     robots = parse_seeds(seeds)

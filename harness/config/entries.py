@@ -23,7 +23,14 @@ import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.controllers.methods import with_aids
-from servobench.harness.config.source import PLACE, SourceFile, describe_at, digest_of_module, import_user_module, show
+from servobench.harness.config.source import (
+    SourceFile,
+    describe_at,
+    digest_of_module,
+    find_place,
+    import_user_module,
+    show,
+)
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.checks import FloatArray
@@ -368,7 +375,7 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
     Raises:
         ConfigurationError: it cannot be used; one line with file and line number.
     """
-    found = PLACE.fullmatch(text)
+    found = find_place(text)
     if found is None:
         raise ConfigurationError(f"{text!r} is no place of a {kind.word}, such as ./mine.py or ./mine.py:Mine")
     place = text.partition("=")[2] if found["alias"] else text

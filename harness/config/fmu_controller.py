@@ -13,6 +13,7 @@ are written, a step of one period is taken, and the outputs are read.
 import contextlib
 import weakref
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
@@ -197,18 +198,18 @@ def mapped_controller(path: Path, name: str) -> ControllerEntry:
     Raises:
         ValueError: the mapping cannot be used.
     """
-    if path.suffix == ".fmu":
+    if path.suffix.lower() == ".fmu":
         mapping, how = _conventional(path), "by the names of exported controllers"
     else:
         mapping = read_mapping(ControllerMapping, path)
         how = f"as mapped by {path.name}"
 
-    @configuration_errors("", FmuError)
-    def build(config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
-        del config
-        return FmuController(mapping, knowledge)
+    return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, partial(_build, mapping))
 
-    return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, build)
+
+@configuration_errors("", FmuError)
+def _build(mapping: ControllerMapping, _config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
+    return FmuController(mapping, knowledge)
 
 
 def _conventional(path: Path) -> ControllerMapping:

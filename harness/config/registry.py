@@ -22,7 +22,7 @@ from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.source import describe_at, is_place
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import user_path
+from servobench.plant.contract.files import is_file, user_path
 from servobench.plant.contract.settings import suggest
 
 PLANTS = {
@@ -111,8 +111,13 @@ class Registry(Generic[Entry]):
         """
         if not isinstance(given, str):
             return self.offer(own_object(self.kind, given))
-        if given.endswith(self.suffixes) and not given.startswith(MAPPED):
-            given = f"{MAPPED}{given}"
+        if given.lower().endswith(self.suffixes):
+            alias, given = _split_alias(given)
+            if not given.startswith(MAPPED):
+                given = f"{MAPPED}{given}"
+            if alias:
+                entry = self.kind.make_entry(self.find(given), given, alias)
+                return self.offer(Own(self.kind.word, entry, given))
         if given not in (*_OFFERED, *self.names()) and not given.startswith(MAPPED) and is_place(given):
             return self.offer(read_own(self.kind, given))
         self.find(given)
@@ -244,7 +249,9 @@ def installed_plant(name: str, *, load: bool = True) -> PlantEntry:
 
 def is_foreign_plant(name: str, *, trusted: bool = False) -> bool:
     """Return whether a plant runs code that is not of this package, or of an FMU that the user trusts like it."""
-    return name not in PLANTS and not (trusted and name.startswith(MAPPED))
+    own = _OFFERED.get(name)
+    place = name if own is None else own.place
+    return name not in PLANTS and not (trusted and place.startswith(MAPPED))
 
 
 def is_foreign_controller(name: str) -> bool:
@@ -257,6 +264,14 @@ def own_modules(plants: Iterable[str], controllers: Iterable[str]) -> tuple[str,
     """Return the modules of this package in which plants and controllers are, as far as they have one of their own."""
     values = [PLANTS.get(name) for name in plants] + [NOT_COMPOSED.get(name) for name in controllers]
     return tuple(value.partition(":")[0] for value in values if value is not None)
+
+
+def _split_alias(given: str) -> tuple[str, str]:
+    """Return name and path of `NAME=PATH`; no name where there is none, or where the whole is a file that exists."""
+    alias, equals, file = given.partition("=")
+    if not equals or not alias.isidentifier() or is_file(given):
+        return "", given
+    return alias, file
 
 
 def _rename(own: Offer) -> str:

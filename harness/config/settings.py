@@ -10,6 +10,7 @@ of which a nominal model is known, where an estimator learns the difference from
 has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 
+import contextlib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -17,14 +18,15 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import parse_toml, read_toml
+from servobench.plant.contract.files import is_file, parse_toml, read_toml
 from servobench.plant.contract.settings import override
 
 Config = TypeVar("Config")
+MAPPED: Final = re.compile(r"\s*(fmu:.+?\.(?i:toml))\.(.+)", re.DOTALL)  # assignment to a plant called as its file
 
 
 class Assignment(NamedTuple):
@@ -40,7 +42,7 @@ class Settings:
     """Overrides of defaults, by section.
 
     Attributes:
-        sections: section -> nested keys -> plain values as TOML gives them.
+        sections: section -> nested or dotted keys, which become nested ones -> plain values as TOML gives them.
         assigned: those of `sections` that came as single assignments.
         filed: section and dotted key of those that came from a file, which may hold every setting with its default.
 
@@ -58,6 +60,7 @@ class Settings:
         if not _is_section(given) or not all(_is_section(each) for each in self.sections.values()):
             wanted = "sections with keys, such as {'kinematic': {'lag': 0.1}}"
             raise ConfigurationError(f"settings must be {wanted}, got {given!r}")
+        object.__setattr__(self, "sections", {name: _undotted(each) for name, each in self.sections.items()})
 
     @configuration_errors()
     def resolve(self, section: str, default: Config) -> Config:
@@ -74,6 +77,19 @@ def _is_section(given: object) -> bool:
     return isinstance(given, Mapping) and all(
         isinstance(key, str) and (not isinstance(value, Mapping) or _is_section(value)) for key, value in given.items()
     )
+
+
+def _undotted(section: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a section with nested keys in place of dotted ones."""
+    dotted = [key for key in section if "." in key]
+    for key in dotted:
+        whole = next((each for each in section if key.startswith(f"{each}.")), None)
+        if whole is not None:
+            raise ConfigurationError(f"settings give {whole!r} and also {key!r}, a part of it; write one of them")
+    nested = {key: value for key, value in section.items() if key not in dotted}
+    for key in dotted:
+        _put(nested, key, section[key])
+    return nested
 
 
 def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
@@ -114,26 +130,33 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings by nested keys, given those by dotted key; None, a setting without a value, is left out."""
     nested: dict[str, Any] = {}
     for key, value in flat.items():
-        *path, name = key.split(".")
-        target = nested
-        for part in path:
-            target = target.setdefault(part, {})
         if value is not None:
-            target[name] = value
+            _put(nested, key, value)
     return nested
 
 
+def _put(nested: dict[str, Any], key: str, value: object) -> None:
+    """Write a value under a dotted key."""
+    *path, name = key.split(".")
+    for part in path:
+        nested = nested.setdefault(part, {})
+    nested[name] = value
+
+
 def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
-    key, equals, text = assignment.partition("=")
-    mapped = re.fullmatch(r"\s*(.+?\.toml)\.(.+)", key)  # a plant's name may be that of a file, fmu:crane.toml
-    path = [mapped[1], *mapped[2].strip().split(".")] if mapped else key.strip().split(".")
+    mapped = MAPPED.fullmatch(assignment)
+    rest = mapped[2] if mapped else assignment
+    key, equals, text = rest.partition("=")
+    path = key.strip().split(".")
+    if mapped:
+        path.insert(0, mapped[1])
     if not equals or len(path) < 2 or not all(path):
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
     bare = text.count(",") > 1 and text.lstrip()[0] not in "[{'\""  # three numbers or more, without brackets
-    try:
-        value = parse_toml(f"value = [{text}]" if bare else f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        value = text.strip()  # a bare word is a string
+    value: Any = text.strip()  # a bare word is a string
+    if not is_file(value) or "#" not in value:  # which would begin a comment
+        with contextlib.suppress(ValueError, RecursionError):
+            value = parse_toml(f"value = [{text}]" if bare else f"value = {text}")["value"]
     target = sections
     for name in path[:-1]:
         target = target.setdefault(name, {})

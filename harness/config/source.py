@@ -20,13 +20,13 @@ from types import ModuleType
 from typing import Final, Self, TypeAlias
 
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import reason, user_path
+from servobench.plant.contract.files import is_file, reason, user_path
 from servobench.plant.contract.settings import suggest
 
 Name: TypeAlias = tuple[str, ...]  # of a module, by its parts
 
 PLACE: Final = re.compile(
-    r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
+    r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.(?i:py))(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
 )
 PACKAGE = "servobench"
 PACKAGE_FOLDER: Final = Path(__file__).parents[2]
@@ -51,7 +51,7 @@ class SourceFile:
             path = (present_folder() / user_path(given)).resolve()
             return cls(path, path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
-            beside = [each.name for each in path.parent.glob("*.py")] if path.parent.is_dir() else []
+            beside = [each.name for each in path.parent.glob("*.[pP][yY]")] if path.parent.is_dir() else []
             hint = suggest(path.name, beside) if beside else f"{show(path.parent)} holds no Python file"
             hint = "a name before = has letters, digits and _ only" if "=" in given.partition("/")[0] else hint
             raise ConfigurationError(f"there is no file {given}: {hint}") from error
@@ -219,9 +219,22 @@ def show(path: Path) -> str:
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
+def find_place(text: str) -> re.Match[str] | None:
+    """Return the parts of the place of code, `[NAME=]FILE.py[:NAME]` or `[NAME=]MODULE:NAME`; None for other texts.
+
+    A file whose path holds an equals sign is taken as it stands if it exists.
+    """
+    found = PLACE.fullmatch(text)
+    if found is None or not found["alias"] or not found["file"]:
+        return found
+    if is_file(text[: found.end("file")]):
+        return PLACE.fullmatch(f"./{text}")
+    return found
+
+
 def is_place(text: str) -> bool:
     """Return whether a text says where code stands, and is no name; of a module, whether there is such a one."""
-    found = PLACE.fullmatch(text)
+    found = find_place(text)
     if found is None or found["file"] is not None:
         return found is not None
     make_importable(present_folder())

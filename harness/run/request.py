@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 from annotated_types import Ge
 
-from servobench.harness.config.source import PLACE, SourceFile, describe_at
+from servobench.harness.config.source import SourceFile, describe_at, find_place
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED, HAND, SETUPS, Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -237,14 +237,17 @@ def with_camera(robot: str, camera: Path) -> str:
     Raises:
         ConfigurationError: a robot or a file that cannot be used.
     """
-    word = f"{robot}{catalogue.WITH}{camera}"
-    find_robot(word)
-    return word
+    for path in (camera, camera.absolute()):  # a file may be called "ur5 with my_camera.toml"
+        word = f"{robot}{catalogue.WITH}{path}"
+        if catalogue.read_word(word).camera == str(path):
+            find_robot(word)
+            return word
+    raise ConfigurationError(f"{word!r} is also the name of a file; give robot or camera another name")
 
 
 def short_name(robot: str) -> str:
     """Return the word for a robot, and for its camera, without the folders of files."""
-    return catalogue.WITH.join(Path(part).name for part in robot.split(catalogue.WITH))
+    return catalogue.with_files(robot, lambda file: Path(file).name)
 
 
 def sensing_names() -> list[str]:
@@ -264,7 +267,7 @@ def find_sensing(word: str) -> Sensing:
 @lru_cache(maxsize=64)
 def _find(word: str, file: SourceFile | None) -> Sensing:
     place = sensing_place(word)
-    found = PLACE.fullmatch(place)
+    found = find_place(place)
     own = {}
     if file is not None and found is not None:
         own[place] = _pick(file, found["file"], found["name"])
@@ -280,7 +283,7 @@ def _find(word: str, file: SourceFile | None) -> Sensing:
 
 def sensing_file(word: str) -> SourceFile | None:
     """Return the file of a user's own set-up; None for one of this package."""
-    found = PLACE.fullmatch(sensing_place(word))
+    found = find_place(sensing_place(word))
     return SourceFile.read(found["file"]) if found is not None and found["file"] else None
 
 

@@ -27,7 +27,7 @@ from typing import Any, Final, Literal, NamedTuple
 from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.config.source import PLACE
+from servobench.harness.config.source import find_place
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, with_camera
 from servobench.harness.run.resolution import resolve
@@ -169,15 +169,18 @@ def find_challenge(word: str) -> Challenge:
     Raises:
         ConfigurationError: there is none, or one line with the fault of its file.
     """
-    if not word.endswith(SUFFIX) and word not in challenge_names():
+    is_own = word.lower().endswith(SUFFIX)
+    if not is_own and word not in challenge_names():
         raise ConfigurationError(f"unknown challenge {word!r}: {suggest(word, challenge_names())}, or a {SUFFIX} file")
-    path = user_path(word) if word.endswith(SUFFIX) else Path(str(FOLDER / f"{word}{SUFFIX}"))
+    path = user_path(word) if is_own else Path(str(FOLDER / f"{word}{SUFFIX}"))
     values = read_toml("challenge", path)
     with configuration_errors(f"{path}: "):
         challenge = override("challenge", Challenge(path.stem), values)
         task, given = challenge.task, flatten(challenge.settings)
-        if (place := PLACE.fullmatch(task)) and place["file"]:
-            task = f"{task[: place.start('file')]}{_seen(path, place['file'])}{task[place.end('file') :]}"
+        if (place := find_place(task)) and place["file"]:
+            before = place.string[: place.start("file")]
+            behind = place.string[place.end("file") :]
+            task = f"{before}{_seen(path, place['file'])}{behind}"
         given |= {key: _seen(path, given[key]) for key in ("task.file",) if key in given}
         camera = _seen(path, challenge.camera) if challenge.camera else ""
         challenge = replace(challenge, task=choose_task(task), camera=camera, settings=given)

@@ -6,9 +6,9 @@ import io
 import os
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Final
 
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
@@ -25,6 +25,8 @@ TOML_TEXT: Final = re.compile(  # a text of any of four kinds, or a comment
 MAX_KEY_PARTS: Final = 32
 TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
 MAX_TOML: Final = 500_000  # [letters] beside texts and comments
+AROUND_FILE: Final = re.compile("[=:]")  # marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
+MAX_COMMAS: Final = 16  # that a path in a comma-separated list may have
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -132,7 +134,7 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
     """Return the table of a Parquet file or else of a CSV file, of which blanks do not count; see `read_toml`."""
     import pandas as pd  # noqa: PLC0415 - lists of names start without it
 
-    text = None if path.suffix == ".parquet" else read_text(kind, path)
+    text = None if path.suffix.lower() == ".parquet" else read_text(kind, path)
     header = (text or ",").partition("\n")[0].strip()
     if "," not in header and (marks := [mark for mark in (";", "\t", " ") if mark in header]):
         raise ConfigurationError(
@@ -188,6 +190,47 @@ def user_path(text: str) -> Path:
         return Path(text).expanduser()
     except RuntimeError as error:
         raise ConfigurationError(f"path {text!r} names a home folder that is not known") from error
+
+
+def is_file(text: str) -> bool:
+    """Return whether a text is the path of a file with an ending."""
+    if not PurePath(text).suffix:
+        return False
+    try:
+        return user_path(text).is_file()
+    except (OSError, ValueError):  # no path at all, or one that may not be looked at
+        return False
+
+
+def divisions(text: str, mark: str) -> list[tuple[str, str]]:
+    """Return a text as a whole, and the parts before and behind each place where a mark stands in it."""
+    found = [(text, "")]
+    for place in re.finditer(re.escape(mark), text):
+        before = text[: place.start()]
+        behind = text[place.end() :]
+        found.append((before, behind))
+    return found
+
+
+def split_words(text: str, known: Container[str] = ()) -> tuple[str, ...]:
+    """Split a comma-separated list, in which a known name and a file that exists may have commas themselves."""
+    parts = text.split(",")
+    words: list[str] = []
+    while parts:
+        for size in range(min(len(parts), MAX_COMMAS + 1), 0, -1):
+            word = ",".join(parts[:size]).strip()
+            if size == 1 or word in known or _names_file(word, size - 1):
+                break
+        del parts[:size]
+        if word:
+            words.append(word)
+    return tuple(words)
+
+
+def _names_file(word: str, commas: int) -> bool:
+    """Return whether a word has the path of a file with all of its commas, alone or between other parts of the word."""
+    parts = [word, *AROUND_FILE.split(word)]
+    return any(part.count(",") == commas and is_file(part) for part in parts)
 
 
 def partial_path(path: Path) -> Path:

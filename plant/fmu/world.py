@@ -454,12 +454,12 @@ def fmu_entry(path: Path) -> PlantEntry:
     Raises:
         ValueError: the mapping cannot be used.
     """
-    if path.suffix == ".fmu":
+    if path.suffix.lower() == ".fmu":
         raise ValueError(f"plant {path} needs a mapping, a TOML that names file, inputs and features")
     mapping = read_mapping(FmuMapping, path)
-
-    def build(config: FmuConfig, setup: PlantSetup) -> Bench:
-        return build_fmu(mapping, setup, config.command_delay, config.sensing)
-
     summary = f"the FMU {mapping.file.name}, as mapped by {path.name}"
-    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, partial(_build, mapping), own_robot=True)
+
+
+def _build(mapping: FmuMapping, config: FmuConfig, setup: PlantSetup) -> Bench:
+    return build_fmu(mapping, setup, config.command_delay, config.sensing)

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
-from typing import Final
+from pathlib import Path, PurePath
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from servobench.plant.contract.files import accessing, read_toml, user_path
+from servobench.plant.contract.files import accessing, divisions, is_file, read_toml, user_path
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
@@ -31,6 +31,7 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
 WITH: Final = " with "  # between a robot and the file of its camera
+SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf")  # that files of robots have
 
 
 def find_robot(text: str) -> Robot:
@@ -44,9 +45,10 @@ def find_robot(text: str) -> Robot:
     Raises:
         ValueError: an unknown name, or a file that cannot be used.
     """
-    name, _, camera = text.partition(WITH)
-    if camera:
-        return _equipped(find_robot(name), camera, _changed("camera", user_path(camera)))
+    word = read_word(text)
+    if word.camera:
+        name = text.removesuffix(WITH + word.camera)
+        return _equipped(find_robot(name), word.camera, _changed("camera", user_path(word.camera)))
     if text in ROBOTS:
         return ROBOTS[text]()
     kind, _, number = text.partition(":")
@@ -54,8 +56,8 @@ def find_robot(text: str) -> Robot:
         if not (number.isascii() and number.isdigit() and len(number) <= len(str(MAX_NUMBER))):
             raise ValueError(f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7")
         return random_robot(int(number))
-    path = user_path(text.partition("#")[0])
-    if path.suffix.lower() not in {".yaml", ".yml", ".toml", ".urdf"}:
+    path = user_path(word.robot)
+    if not _is_robot_file(word.robot):
         kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
         wanted = f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
         raise ValueError(f"unknown robot {text!r}: {wanted}")
@@ -68,11 +70,56 @@ def _changed(kind: str, path: Path) -> int:
         return path.stat().st_mtime_ns
 
 
-def with_files(text: str, change: Callable[[str], str]) -> str:
-    """Return the text of a robot with the paths of robot and camera, or its name, changed."""
-    robot, separator, camera = text.partition(WITH)
-    file, mark, link = robot.partition("#")
-    return change(file) + mark + link + separator + (change(camera) if camera else "")
+class RobotWord(NamedTuple):
+    """The parts of a text that stands for a robot."""
+
+    robot: str  # a name, or the path of a file
+    link: str = ""  # that carries the ball
+    camera: str = ""  # the path of a file
+
+    def is_likely(self) -> bool:
+        """Return whether the parts look like a robot with a link and a camera, without a look at files."""
+        if self.camera.lower().endswith(".urdf"):
+            return False
+        return _is_robot_file(self.robot) or not (self.link or "/" in self.robot or "#" in self.robot)
+
+
+def read_word(text: str, is_there: Callable[[str], bool] = is_file) -> RobotWord:
+    """Return the parts of a text that stands for a robot, `ROBOT#LINK with CAMERA`.
+
+    The path of a file that exists is taken as it stands, also where it holds these marks itself.
+
+    Args:
+        text: as a user wrote it.
+        is_there: says whether a path is that of a file.
+    """
+    if WITH not in text and "#" not in text:
+        return RobotWord(text)
+    whole = [RobotWord(*parts) for parts in divisions(text, "#") if WITH not in parts[1]]
+    equipped = [
+        RobotWord(*parts, camera)
+        for robot, camera in divisions(text, WITH)
+        if camera
+        for parts in divisions(robot, "#")
+    ]
+    there = (each for each in [*whole, *equipped] if _is_robot_file(each.robot) and is_there(each.robot))
+    likely = (each for each in [*equipped, *whole[1:]] if each.is_likely())
+    return next(there, None) or next(likely, whole[0])
+
+
+def _is_robot_file(name: str) -> bool:
+    return PurePath(name).suffix.lower() in SUFFIXES
+
+
+def with_files(text: str, change: Callable[[str], str], is_there: Callable[[str], bool] = is_file) -> str:
+    """Return the text of a robot with the paths of robot and camera, or its name, changed; see `read_word`."""
+    robot, link, camera = read_word(text, is_there)
+    changed = change(robot)
+    if link:
+        changed += f"#{link}"
+    if camera:
+        changed += f"{WITH}{change(camera)}"
+    return changed
 
 
 @cache
@@ -85,7 +132,7 @@ def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
 def _read(text: str, changed: int) -> Robot:
     from servobench.plant.robot import files  # noqa: PLC0415 - only files need their readers
 
-    name, _, tip = text.partition("#")
+    name, tip, _ = read_word(text)
     path = user_path(name)
     kind = path.suffix.lower()
     if kind == ".urdf":
@@ -97,10 +144,13 @@ def _read(text: str, changed: int) -> Robot:
     values = read_toml("robot file", path)
     if "robot" not in values:
         return files.read_dh_robot(path, values)
-    named = with_files(
-        str(values["robot"]), lambda file: str(beside if (beside := path.parent / file).is_file() else file)
-    )
-    base = user_path(named.partition(WITH)[0])
+
+    def locate(file: str) -> str:
+        beside = path.parent / file
+        return str(beside) if beside.is_file() else file
+
+    named = with_files(str(values["robot"]), locate, lambda file: is_file(locate(file)))
+    base = user_path(read_word(named).robot)
     if base.suffix.lower() == ".toml" and "robot" in read_toml("robot file", base):
         raise ValueError(f"twin {path}: its robot must be the one that controllers know, got the twin {named}")
     robot = find_robot(named)

@@ -166,3 +166,11 @@ def test_a_file_that_does_not_fit_is_refused(tuned, text, message):
     tuned(text)
     with pytest.raises(ConfigurationError, match=message):
         default_config(METHODS["ukf_mfac"])
+
+
+def test_dotted_keys_are_settings_of_nested_sections():
+    given = Settings({"outer": {"inner.gain": 3.0, "inner.kind": "two", "count": 4}, "fmu:a.toml": {"lag": 0.1}})
+    assert given.sections["outer"] == {"count": 4, "inner": {"gain": 3.0, "kind": "two"}}
+    assert given.resolve("outer", Outer()) == Outer(count=4, inner=Inner(3.0, "two"))
+    with pytest.raises(ConfigurationError, match=r"settings give 'inner' and also 'inner\.gain', a part of it"):
+        Settings({"outer": {"inner.gain": 3.0, "inner": {"kind": "two"}}})

@@ -158,9 +158,10 @@ def test_twins_of_each_other_are_refused(tmp_path):
             find_robot(str(path))
 
 
-def test_a_twin_finds_its_robot_beside_itself(tmp_path, monkeypatch):
-    write(tmp_path, FOUR_JOINTS, "arm.toml")
-    own = TWIN.replace("ur10e", "arm.toml").replace("elbow", "joint_3")
+@pytest.mark.parametrize("name", ["arm.toml", "arm with gripper#2.toml"])
+def test_a_twin_finds_its_robot_beside_itself(tmp_path, monkeypatch, name):
+    write(tmp_path, FOUR_JOINTS, name)
+    own = TWIN.replace("ur10e", name).replace("elbow", "joint_3")
     path = written(tmp_path, own)
     monkeypatch.chdir(tmp_path.parent)
     assert find_robot(path).n == 4
