@@ -1,6 +1,11 @@
-"""Runs as environments of Gymnasium: `servobench/Servo-v0`. Needs the extra `gym`."""
+"""Runs as environments of Gymnasium: `servobench/Servo-v0`. Needs the extra `gym`.
 
-from typing import Final
+Gymnasium 1 has no entry points by which a process could find names that it has not imported. So a process that imports
+this module also hands the name to processes that it starts by multiprocessing, whatever the start method.
+"""
+
+from multiprocessing import current_process
+from typing import Final, final
 
 import gymnasium
 
@@ -14,4 +19,14 @@ def register() -> None:
         gymnasium.register(ENVIRONMENT, entry_point=f"{place}:ServoEnv", vector_entry_point=f"{place}:ServoVectorEnv")
 
 
+@final
+class Inherited:
+    """A mark in the configuration that a process pickles for its children: to unpickle it imports this module there."""
+
+    def __reduce__(self) -> tuple[type["Inherited"], tuple[()]]:
+        """Return how it is made anew."""
+        return Inherited, ()
+
+
 register()
+vars(current_process()).get("_config", {})[ENVIRONMENT] = Inherited()

@@ -8,6 +8,7 @@ import cv2
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -114,6 +115,13 @@ def check_options(options: object) -> None:
         raise ConfigurationError(f"reset has no options, got {options!r}; make another environment for another choice")
 
 
+def with_length(made: EnvSpec | None, periods: int) -> EnvSpec | None:
+    """Return a specification of Gymnasium that tells the length of an episode, a number of periods."""
+    if made is None:
+        return None
+    return replace(made, max_episode_steps=periods)
+
+
 def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
     """Return the same run with another seed, and so another robot, target and noise."""
     return replace(resolved, request=replace(resolved.request, seed=seed))
@@ -135,6 +143,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
     Attributes:
         natural_size: of a feature, in its unit.
+        periods: of an episode.
         resolved: the settings that all runs share.
     """
 
@@ -149,14 +158,18 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         sensing: str = DEFAULT_SENSING,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
         render_mode: str | None = None,
+        **others: object,
     ) -> None:
         """Look everything up; names and settings are those of `servobench.run`.
 
         With the `render_mode` "rgb_array", `render` returns pictures.
 
         Raises:
-            ConfigurationError: a name, setting, mismatch or mode that cannot be used.
+            ConfigurationError: a name, setting, mismatch or mode that cannot be used, or another argument.
         """
+        for name in others:
+            remedy = f"settings={{{plant!r}: {{...}}}} has the settings of the plant, such as 'sensing.latency': 0.1"
+            raise ConfigurationError(f"an environment has no argument {name!r}; {remedy}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         self.render_mode = render_mode
@@ -174,7 +187,18 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self.metadata = self.metadata | {"render_fps": 1.0 / self._spaces.spec.period}
         self._outside: OutsideScene | None = None
         self.natural_size = self._spaces.spec.feature.scale
+        self.periods: Final = experiment.periods
+        self._spec: EnvSpec | None = None
         self.observation_space, self.action_space = self._spaces.observations, self._spaces.actions
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made the environment, with the length of an episode; None if it was not made by it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made: EnvSpec | None) -> None:
+        self._spec = with_length(made, self.periods)
 
     @property
     def observation(self) -> Observation | None:
@@ -338,11 +362,18 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
     _many: Experiment | None = None  # the runs; an object whose choice is refused is closed, too
 
-    def __init__(self, num_envs: int = 1, **choice: Any) -> None:  # noqa: ANN401 - typed by `ServoEnv`
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        **choice: Any,  # noqa: ANN401 - typed by `ServoEnv`
+    ) -> None:
         """Look everything up.
 
         Args:
             num_envs: number of lanes.
+            max_episode_steps: length of an episode, for Gymnasium, which passes what `ServoEnv.spec` tells.
             choice: arguments of `ServoEnv`, which all runs share.
 
         Raises:
@@ -355,6 +386,9 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
         single = ServoEnv(**choice)
         self._resolved = single.resolved
+        if max_episode_steps not in (None, single.periods):
+            wanted = f"max_episode_steps must be {single.periods}, as the task has so many periods"
+            raise ConfigurationError(f"{wanted}, got {max_episode_steps}; settings= may change its duration")
         if side_by_side_key(self._resolved) is None:
             alone = f"plant {self._resolved.request.plant} carries out one run at a time"
             raise ConfigurationError(f"{alone}: gymnasium.make_vec(..., vectorization_mode='async')")

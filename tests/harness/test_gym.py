@@ -2,10 +2,12 @@
 
 import pickle
 import re
+from multiprocessing import get_context
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeAwareObservation
 from gymnasium.wrappers.vector import DictInfoToList
 
 from kit.plants import plant_parameters
@@ -249,3 +251,32 @@ def test_version_0_still_gives_what_it_gave():
     assert ENVIRONMENT.endswith("-v0")
     np.testing.assert_allclose([rewards[0], sum(rewards)], [-0.028570258752639313, -0.5935999997431326], rtol=1e-9)
     env.close()
+
+
+@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+def test_processes_find_the_environment_however_they_are_started(method):
+    child = get_context(method).Process(target=gymnasium.spec, args=(ENVIRONMENT,))
+    child.start()
+    child.join(120)
+    assert child.exitcode == 0
+
+
+def test_the_specification_tells_the_length_of_an_episode():
+    env = TimeAwareObservation(gymnasium.make(ENVIRONMENT, task="exp2", settings={"exp2": {"duration": 0.2}}))
+    assert env.spec.max_episode_steps == 4
+    env.reset(seed=1)
+    ends = [env.step(np.zeros(6))[2:4] for _ in range(4)]
+    assert ends == [(False, False)] * 3 + [(False, True)]
+    again = gymnasium.make(env.unwrapped.spec)
+    assert again.spec.max_episode_steps == 4
+    many = gymnasium.make_vec(again.spec, num_envs=2, vectorization_mode="vector_entry_point")
+    assert many.unwrapped.single_observation_space == again.observation_space
+    with pytest.raises(ConfigurationError, match="max_episode_steps must be 4, as the task has so many periods, got 5"):
+        ServoVectorEnv(2, task="exp2", settings={"exp2": {"duration": 0.2}}, max_episode_steps=5)
+
+
+def test_an_argument_that_is_a_setting_is_refused_with_the_place_of_settings():
+    with pytest.raises(ConfigurationError, match=r"no argument 'latency'; settings=\{'kinematic': \{\.\.\.\}\} has"):
+        gymnasium.make(ENVIRONMENT, latency=0.1)
+    env = ServoEnv(settings={"kinematic": {"sensing.latency": 0.1, "lag": 0.02}})
+    assert env.resolved.plant.sensing.latency == 0.1
