@@ -87,9 +87,12 @@ class RenderedWorld(World):
         """Open a scene and a simulation with the arm.
 
         Raises:
-            ValueError: a start of the wrong size, a list that does not fit the joints, a gear ratio of 0, or a window
-                without a display.
+            ValueError: a start of the wrong size, a list that does not fit the joints, a gear ratio of 0, masses that
+                no body has, or a window without a display.
         """
+        robot = setup.nominal or find_robot(UR5)
+        if robot.flaw:
+            raise ValueError(f"robot {robot.name}: {robot.flaw}")
         model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
@@ -106,7 +109,7 @@ class RenderedWorld(World):
             raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")
         self._camera = model.camera
         self._valid: BoolArray | None = None
-        boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
+        boxes = config.boxes()
         room = Room(arm, config.scenery, robot, boxes, model if isinstance(model, SetupModel) else None)
         self._scene = engine.scene(room, window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)

@@ -24,6 +24,7 @@ from servobench.plant.robot.camera_file import read_camera
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.twin import read_twin
+from servobench.plant.robot.urdf_elements import RUN_XACRO
 from servobench.plant.robot.workspace import search_workspace, with_ball
 
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
@@ -57,6 +58,8 @@ def find_robot(text: str) -> Robot:
             raise ValueError(f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7")
         return random_robot(int(number))
     path = user_path(word.robot)
+    if path.suffix.lower() == ".xacro":
+        raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"
         wanted = f"{suggest(text, ROBOTS)}; or a file: {kinds}; or an arm that is drawn, {RANDOM_ARM}:7"
@@ -130,13 +133,13 @@ def _equipped(robot: Robot, camera: str, changed: int) -> Robot:
 
 @cache
 def _read(text: str, changed: int) -> Robot:
-    from servobench.plant.robot import files  # noqa: PLC0415 - only files need their readers
+    from servobench.plant.robot import files, urdf_file  # noqa: PLC0415 - only files need their readers
 
     name, tip, _ = read_word(text)
     path = user_path(name)
     kind = path.suffix.lower()
     if kind == ".urdf":
-        return files.read_urdf_robot(path, tip)
+        return urdf_file.read_urdf_robot(path, tip)
     if tip:
         raise ValueError(f"robot {text!r}: only a .urdf has links to be named after '#'")
     if kind != ".toml":

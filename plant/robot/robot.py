@@ -62,6 +62,7 @@ class Robot:
     workspace: Workspace  # where it works, and where the camera hangs
     measured: SerialArm | None = None  # the arm as its factory measured it; None where only the nominal one is known
     note: str = ""  # a line for the user about assumptions; empty for none
+    flaw: str = ""  # why the physics engines cannot move it; empty for a robot that they can
     known: bool = True  # whether controllers may know it; of another one they know joints and features alone
     camera: OwnCamera | None = None  # of the user, in place of the bench's; None for none
     twin: Twin | None = None  # the true robot as identified from a log, in place of mismatches; None for none

@@ -55,3 +55,30 @@ def odd_urdf():
             f'<origin xyz="{xyz}" rpy="{rpy}"/>{turning}</joint>'
         )
     return f'<robot name="odd">{"".join(parts)}</robot>'
+
+
+def urdf_of(*joints, name="arm"):
+    """Return a URDF of joints with their links.
+
+    Args:
+        joints: (name, type, parent link, child link, further elements); a rotating or sliding joint that has no limit
+            among these gets one.
+        name: of the robot.
+    """
+    links = dict.fromkeys(link for joint in joints for link in joint[2:4])
+    parts = [f'<link name="{link}"/>' for link in links]
+    for own, kind, parent, child, *further in joints:
+        elements = "".join(further)
+        if kind in ("revolute", "prismatic") and "<limit" not in elements:
+            elements += '<limit lower="-0.04" upper="2.5" effort="50" velocity="2"/>'
+        parts.append(
+            f'<joint name="{own}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{elements}</joint>'
+        )
+    return f'<robot name="{name}">{"".join(parts)}</robot>'
+
+
+def arm_joints(n, prefix="", root="base"):
+    """Return n rotating joints one after another as `urdf_of` takes them; joint i leads to link i."""
+    links = [root, *(f"{prefix}link_{i}" for i in range(1, n + 1))]
+    place = '<origin xyz="0 0.1 0.2"/>'
+    return [(f"{prefix}joint_{i}", "revolute", links[i - 1], links[i], place) for i in range(1, n + 1)]

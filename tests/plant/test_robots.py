@@ -229,7 +229,7 @@ def test_an_unlikely_urdf_is_remarked_on(tmp_path, caplog):
         (
             'lower="-2.5" upper="2.5" effort="50" velocity="2"',
             'upper="2.5"',
-            "limits that the URDF lacks are taken as ±2π rad and π rad/s: range of joint_1, velocity of joint_1, range",
+            "limits that the URDF lacks are taken as ±2π rad and π rad/s: lower of joint_1, velocity of joint_1",
         ),
         ('rpy="0.1', 'rpy="90', "has an rpy of 90, and angles of a URDF are in rad"),
         (
@@ -290,20 +290,13 @@ TWO_TREES = ODD.replace(*(f'<parent link="link_{i}"/><child link="link_{7 - i}"/
             HEAVY.replace("0 0 0.3", "0 3 0.3"),
             r": the arm has no posture .* at \(0, 3, 0.3\) m; .* an arm at \(0, 0, 0\)",
         ),
-        (
-            HEAVY.replace('ixy="0"', 'ixy="0.02"'),
-            ": link 'link_1': inertia must be positive definite, got principal moments -0.01, 0.01, 0.03 kg m²; for an",
-        ),
         (HEAVY.replace('<mass value="2', '<mass value="-2'), ": link 'link_1': mass must be above 0, got -2.0"),
         (TWO_TREES, ".*both foot and link_4 are without a parent: a joint is missing or turned"),
         (
             ODD.replace('<link name="link_1"/>', '<link name="dink_1"/>'),
             ".*joint 'joint_1' is between links of which the file has no 'link_1'",
         ),
-        *(
-            (text, r" is no URDF, with a <robot> .*line \d+, column \d+")
-            for text in ("<", "<robot name='a'><link", ODD + "<")
-        ),
+        *((text, r" is no URDF: .*line \d+, column \d+") for text in ("<", "<robot name='a'><link", ODD + "<")),
     ],
 )
 def test_a_urdf_of_no_arm_is_refused_in_one_line_in_which_its_reader_says_why(tmp_path, caplog, text, message):

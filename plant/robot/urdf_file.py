@@ -1,0 +1,214 @@
+"""A robot from a URDF: its chain of rotating joints, with its limits, masses and torques."""
+
+from collections import defaultdict
+from math import inf, isfinite, pi
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.faults import configuration_errors
+from servobench.plant.contract.settings import Check, JointSpeed, Number, read_value, remark
+from servobench.plant.robot.arm import JointLimits, SerialArm, rpy_from_rotation
+from servobench.plant.robot.files import Mass
+from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
+from servobench.plant.robot.urdf_chain import Joint, find_chain, pose_of
+from servobench.plant.robot.urdf_elements import read_elements
+from servobench.plant.robot.workspace import find_workspace, with_ball
+
+LIMITS: Final = Check.of(tuple[Annotated[Number, Ge(-30.0), Le(30.0)], ...], bare=True)
+SPEEDS: Final = Check.of(tuple[JointSpeed, ...], bare=True)
+MASS: Final = Check.of(Mass, bare=True)
+USUAL_LIMIT: Final = 4.0 * pi  # [rad]
+UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
+DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side of a joint whose limit is not given
+DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
+DEFAULTS: Final = "±2π rad and π rad/s"
+INERTIA_MARGIN: Final = 1e-6  # [1] of the largest moment, by which the others' sum is above it despite rounding
+ROUNDED_INERTIA: Final = 5e-3  # [1] of the largest moment, by which it exceeds the others' sum without a remark
+FLAT_INERTIA: Final = 0.9  # [1] of the largest moment, by which it exceeds the others' sum in no real file
+MAX_GYRATION: Final = 2.0 / 3.0  # [1] radius of gyration over the arm's length; 1/2 for weights at both ends of a rod
+MAX_DENSITY: Final = 22_600.0  # [kg/m³] of osmium, whose sphere has the least inertia of a mass
+
+
+def read_urdf_robot(path: Path, tip: str) -> Robot:
+    """Return the robot of a URDF.
+
+    Args:
+        path: the file; meshes are not read.
+        tip: the link that carries the ball; empty for the last link before the tool, see `find_chain`.
+
+    Raises:
+        ValueError: the file is missing, malformed, or describes no serial arm with turning joints.
+    """
+    tree = read_elements(path)
+    flaws = list[str]()
+    with configuration_errors(f"robot file {path}: "):
+        joints, flange, tip, ending = find_chain(tree, tip)
+        names = tuple(link.joint.name for link in joints)
+        origins = np.stack([*(link.origin for link in joints), flange])
+        n = len(joints)
+        rpy = rpy_from_rotation(origins[:, :3, :3])
+        arm = with_ball(SerialArm(names, origins[:, :3, 3], rpy, np.zeros(n), np.ones(n), np.zeros(3)))
+        limits = _limits([link.joint for link in joints])
+        links, note = _links(tree, joints, arm, flaws)
+        workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+    flaw = ""
+    if flaws:
+        flaw = flaws[0]
+        remark(f"robot file {path}: {flaw}; the physics engines refuse it")
+    line = f"{path.name}: {n} joints from {names[0]} to {names[-1]}, the ball on {tip}"
+    lines = [each for each in (line, ending, note) if each]
+    title = str(tree.name)
+    return Robot(path.stem, title, path.name, arm, limits, links, workspace, note="; ".join(lines), flaw=flaw)
+
+
+def _limits(joints: list[Any]) -> JointLimits:
+    """Return the limits; soft limits of a safety controller count where they are narrower."""
+    told = defaultdict[str, list[str]](list)  # remark -> what it is about
+    rows = []
+    for joint in joints:
+        name = f"joint {joint.name!r}"
+        lower, upper = -DEFAULT_RANGE, DEFAULT_RANGE
+        if joint.type != "continuous":
+            lower = _limit(joint, "lower", lower, told)
+            upper = _limit(joint, "upper", upper, told)
+            safety = joint.safety_controller
+            if safety is not None and safety.soft_lower_limit is not None:
+                lower = max(lower, safety.soft_lower_limit)
+            if safety is not None and safety.soft_upper_limit is not None:
+                upper = min(upper, safety.soft_upper_limit)
+        speed = _limit(joint, "velocity", DEFAULT_SPEED, told)
+        read_value(f"{name}: limits", (float(lower), float(upper)), LIMITS, lambda: "rad")
+        read_value(f"{name}: velocity", (float(speed),), SPEEDS, lambda: "rad/s")
+        if lower >= upper:
+            raise ValueError(f"{name}: lower must be below upper, got {lower:g} and {upper:g}")
+        if max(-lower, upper) > USUAL_LIMIT:
+            told["limits beyond ±4π rad; angles of a URDF are in rad"].append(joint.name)
+        rows.append((lower, upper, speed))
+    for text, names in told.items():
+        remark(f"{text}: {', '.join(names)}")
+    lowers, uppers, speeds = np.array(rows, dtype=np.float64).T
+    return JointLimits(lowers, uppers, speeds)
+
+
+def _limit(joint: Any, word: str, default: float, told: dict[str, list[str]]) -> float:  # noqa: ANN401
+    """Return a limit of a joint; the default where it is not given or infinite."""
+    given = getattr(joint.limit, word, None)
+    if given is None or (given == 0.0 and word == "velocity"):
+        told[f"limits that the URDF lacks are taken as {DEFAULTS}"].append(f"{word} of {joint.name}")
+        return default
+    if abs(given) == inf or (abs(given) >= UNLIMITED and word != "velocity"):
+        told[f"unlimited in the URDF, and taken as {DEFAULTS}"].append(f"{word} of {joint.name}")
+        return default
+    return float(given)
+
+
+def _links(tree: Any, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> tuple[Links, str]:  # noqa: ANN401
+    """Return the links, estimated where the file has no values, and a line about the estimates.
+
+    Args:
+        tree: the file.
+        chain: the joints.
+        arm: of these joints.
+        flaws: takes what no body has.
+    """
+    inertials = {link.name: link.inertial for link in tree.links}
+    own = [inertials[link.joint.child] for link in chain]
+    efforts = [getattr(link.joint.limit, "effort", None) or 0.0 for link in chain]
+    torque = None
+    if all(isfinite(effort) and effort > 0.0 for effort in efforts):
+        torque = np.array(efforts)
+    given = [inertial is not None and inertial.mass and np.any(inertial.inertia) for inertial in own]
+    if not all(given):
+        further = "" if torque is not None else ", torque limits"
+        lacking = ", ".join(link.joint.child for link, known in zip(chain, given, strict=True) if not known)
+        cause = f" (no mass or inertia of {lacking})" if any(given) else ""
+        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{further}{cause}"
+    reach = float(np.linalg.norm(arm.translation[1:], axis=1).sum())
+    bodies = [_body(tree, chain, link, reach, flaws) for link in chain]
+    mass, centre, inertia = (np.array(each) for each in zip(*bodies, strict=True))
+    links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
+    return links, "" if torque is not None else "estimated: torque limits"
+
+
+def _body(
+    tree: Any,  # noqa: ANN401
+    chain: list[Joint],
+    link: Joint,
+    reach: float,
+    flaws: list[str],
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return mass [kg], centre (3,) [m] and inertia (3, 3) [kg m²] of a link and of all that hangs on it.
+
+    These are links behind fixed joints, such as a tool, and behind joints that no controller moves, such as fingers.
+    """
+    inertials = {each.name: each.inertial for each in tree.links}
+    onward = {each.joint.name for each in chain}
+    waiting = [(link.joint.child, link.aligned.T)]
+    met = set[str]()
+    parts = list[tuple[str, float, FloatArray, FloatArray]]()
+    while waiting:
+        name, pose = waiting.pop()
+        met.add(name)
+        waiting += [
+            (joint.child, pose @ pose_of(joint.origin))
+            for joint in tree.joints
+            if joint.parent == name and joint.name not in onward and joint.child not in met
+        ]
+        own = inertials[name]
+        if own is not None and own.mass:
+            read_value(f"link {name!r}: mass", float(own.mass), MASS, lambda: "kg")
+            placed = pose @ pose_of(own.origin)
+            R = placed[:3, :3]
+            inertia = np.zeros((3, 3))
+            if np.any(own.inertia):
+                inertia = _balanced(name, own.inertia, flaws)
+            parts.append((name, float(own.mass), placed[:3, 3], R @ inertia @ R.T))
+    mass = sum(each for _, each, _, _ in parts)
+    centre = np.sum([each * place for _, each, place, _ in parts], axis=0) / mass
+    whole = np.zeros((3, 3))
+    for _, each, place, inertia in parts:
+        off = place - centre
+        whole += inertia + each * (off @ off * np.eye(3) - np.outer(off, off))
+    if not flaws:
+        culprit = max(parts, key=lambda part: float(np.trace(part[3])))
+        flaws += _implausible(culprit[0], mass, whole, reach)
+    return mass, centre, whole
+
+
+def _implausible(link: str, mass: float, inertia: FloatArray, reach: float) -> list[str]:
+    """Return why no link of an arm of length `reach` [m] has this mass [kg] and inertia (3, 3) [kg m²]."""
+    largest = float(np.linalg.eigvalsh(inertia)[-1])
+    most = mass * (MAX_GYRATION * reach) ** 2
+    radius = (3.0 * mass / (4.0 * pi * MAX_DENSITY)) ** (1.0 / 3.0)
+    least = 0.4 * mass * radius**2
+    if least <= largest <= most:
+        return []
+    bounds = f"from {least:.2g} to {most:.2g} for {mass:.3g} kg on an arm of {reach:.2g} m"
+    return [f"link {link!r}: inertia is implausible, as its largest moment is {largest:.3g} kg m²; possible: {bounds}"]
+
+
+def _balanced(link: str, given: FloatArray, flaws: list[str]) -> FloatArray:
+    """Return the nearest inertia, (3, 3) kg m², whose largest principal moment is at most the sum of the others.
+
+    Published files exceed it, by rounding or by more: PyBullet then takes no inertia, and MuJoCo refuses the body.
+    """
+    inertia = as_array(f"link {link!r}: inertia", given, (3, 3))
+    moments, axes = np.linalg.eigh(inertia)
+    came = f"principal moments {', '.join(f'{moment:.3g}' for moment in moments)} kg m²"
+    if not moments[0] > 0.0:
+        flaws.append(f"link {link!r}: inertia must be positive definite, got {came}; for an estimate write zeros")
+        return np.zeros((3, 3))
+    excess = (1.0 + INERTIA_MARGIN) * moments[2] - moments[0] - moments[1]
+    if excess <= 0.0:
+        return inertia
+    if excess > FLAT_INERTIA * moments[2]:
+        flaws.append(f"link {link!r}: no body has the {came}, one far above the others' sum")
+    moments = moments + excess / (3.0 + INERTIA_MARGIN) * np.array([1.0, 1.0, -1.0])
+    if excess > ROUNDED_INERTIA * moments[2]:
+        taken = ", ".join(f"{moment:.3g}" for moment in moments)
+        remark(f"link {link!r}: no body has the {came}, one above the others' sum; taken as {taken}")
+    return np.asarray(axes * moments @ axes.T)
