@@ -18,7 +18,8 @@ from servobench.plant.robot.files import Lengths
 
 TURNING: Final = ("revolute", "continuous")
 MIN_JOINTS: Final = 3  # least number of rotating joints of an arm
-GRIPPER: Final = re.compile(r"finger|thumb|knuckle|gripper|jaw|claw", re.IGNORECASE)
+FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)  # in the name of a link or a joint
+GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)  # in that of a joint
 WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)  # turns a whole gripper
 MAX_STROKE: Final = 0.1  # [m] longest travel of a sliding joint that is a finger without a name or a companion
 LENGTHS: Final = Check.of(Lengths, bare=True)
@@ -156,7 +157,7 @@ def _tool(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
             continue
         if followers[joint.name]:
             tool[joint.name] = f"mimicked by {followers[joint.name]}"
-        elif GRIPPER.search(joint.name) and not WRIST.search(joint.name):
+        elif (GRIPPER.search(joint.name) or FINGER.search(joint.child)) and not WRIST.search(joint.name):
             tool[joint.name] = "by its name"
     return tool
 

@@ -65,7 +65,9 @@ OF_OTHERS: Final = (
 )  # parts of a robot for other programs
 OF_XACRO: Final = ("property", "macro", "include", "insert_block", "if", "unless", "arg")  # elements without a prefix
 EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # of xacro
-DYNAMIC: Final = re.compile(r"effort|torque|current|velocity|accel|decel|jerk")  # in names of limits without geometry
+DYNAMIC: Final = re.compile(
+    r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff"
+)  # in names of limits without geometry
 NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 INFINITE: Final = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
 ZEROS: Final = re.compile(r"[-+.0\s]*")

@@ -10,18 +10,19 @@ from annotated_types import Ge, Le
 
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import configuration_errors
-from servobench.plant.contract.settings import Check, JointSpeed, Number, read_value, remark
+from servobench.plant.contract.settings import Check, Number, Positive, read_value, remark
 from servobench.plant.robot.arm import JointLimits, SerialArm, rpy_from_rotation
 from servobench.plant.robot.files import Mass
 from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
-from servobench.plant.robot.urdf_chain import Joint, find_chain, pose_of
+from servobench.plant.robot.urdf_chain import Chain, Joint, find_chain, pose_of
 from servobench.plant.robot.urdf_elements import read_elements
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 LIMITS: Final = Check.of(tuple[Annotated[Number, Ge(-30.0), Le(30.0)], ...], bare=True)
-SPEEDS: Final = Check.of(tuple[JointSpeed, ...], bare=True)
+SPEEDS: Final = Check.of(tuple[Positive, ...], bare=True)
 MASS: Final = Check.of(Mass, bare=True)
 USUAL_LIMIT: Final = 4.0 * pi  # [rad]
+USUAL_SPEEDS: Final = (0.01, 20.0)  # [rad/s]
 UNLIMITED: Final = 1e3  # [rad], [rad/s] from which on a limit is none
 DEFAULT_RANGE: Final = 2.0 * pi  # [rad] to either side of a joint whose limit is not given
 DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
@@ -46,23 +47,29 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
     tree = read_elements(path)
     flaws = list[str]()
     with configuration_errors(f"robot file {path}: "):
-        joints, flange, tip, ending = find_chain(tree, tip)
-        names = tuple(link.joint.name for link in joints)
-        origins = np.stack([*(link.origin for link in joints), flange])
-        n = len(joints)
-        rpy = rpy_from_rotation(origins[:, :3, :3])
-        arm = with_ball(SerialArm(names, origins[:, :3, 3], rpy, np.zeros(n), np.ones(n), np.zeros(3)))
-        limits = _limits([link.joint for link in joints])
-        links, note = _links(tree, joints, arm, flaws)
+        chain = find_chain(tree, tip)
+        arm = _arm(chain)
+        limits = _limits([link.joint for link in chain.joints])
+        links, note = _links(tree, chain.joints, arm, flaws)
         workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
     flaw = ""
     if flaws:
         flaw = flaws[0]
         remark(f"robot file {path}: {flaw}; the physics engines refuse it")
-    line = f"{path.name}: {n} joints from {names[0]} to {names[-1]}, the ball on {tip}"
-    lines = [each for each in (line, ending, note) if each]
+    names = arm.joint_names
+    line = f"{path.name}: {arm.n} joints from {names[0]} to {names[-1]}, the ball on {chain.tip}"
+    lines = [each for each in (line, chain.ending, note) if each]
     title = str(tree.name)
     return Robot(path.stem, title, path.name, arm, limits, links, workspace, note="; ".join(lines), flaw=flaw)
+
+
+def _arm(chain: Chain) -> SerialArm:
+    """Return the kinematics of a chain, with a ball."""
+    names = tuple(link.joint.name for link in chain.joints)
+    n = len(names)
+    origins = np.stack([*(link.origin for link in chain.joints), chain.flange])
+    rpy = rpy_from_rotation(origins[:, :3, :3])
+    return with_ball(SerialArm(names, origins[:, :3, 3], rpy, np.zeros(n), np.ones(n), np.zeros(3)))
 
 
 def _limits(joints: list[Any]) -> JointLimits:
@@ -87,6 +94,8 @@ def _limits(joints: list[Any]) -> JointLimits:
             raise ValueError(f"{name}: lower must be below upper, got {lower:g} and {upper:g}")
         if max(-lower, upper) > USUAL_LIMIT:
             told["limits beyond ±4π rad; angles of a URDF are in rad"].append(joint.name)
+        if not USUAL_SPEEDS[0] <= speed <= USUAL_SPEEDS[1]:
+            told["velocities that are usually from 0.01 to 20 rad/s; those of a URDF are in rad/s"].append(joint.name)
         rows.append((lower, upper, speed))
     for text, names in told.items():
         remark(f"{text}: {', '.join(names)}")
@@ -167,6 +176,9 @@ def _body(
             if np.any(own.inertia):
                 inertia = _balanced(name, own.inertia, flaws)
             parts.append((name, float(own.mass), placed[:3, 3], R @ inertia @ R.T))
+            away = float(np.linalg.norm(placed[:3, 3]))
+            if away > reach:
+                flaws.append(f"link {name!r}: its centre of mass is {away:.3g} m from joint {link.joint.name!r}")
     mass = sum(each for _, each, _, _ in parts)
     centre = np.sum([each * place for _, each, place, _ in parts], axis=0) / mass
     whole = np.zeros((3, 3))

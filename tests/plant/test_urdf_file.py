@@ -16,7 +16,7 @@ from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.urdf_chain import find_chain
 from servobench.plant.robot.urdf_elements import read_elements
-from servobench.plant.robot.urdf_file import _limits, read_urdf_robot
+from servobench.plant.robot.urdf_file import _arm, _limits, _links, read_urdf_robot
 
 pytest.importorskip("yourdfpy")
 
@@ -33,6 +33,14 @@ def _remarks_anew():
 
 def chain_of(folder, text, tip=""):
     return find_chain(read_elements(write(folder, text, "arm.urdf")), tip)
+
+
+def links_of(folder, text):
+    """Return the links of a URDF's robot, and what no body has of them."""
+    tree = read_elements(write(folder, text, "arm.urdf"))
+    chain = find_chain(tree, "")
+    flaws = []
+    return _links(tree, chain.joints, _arm(chain), flaws)[0], flaws
 
 
 def flange(chain):
@@ -58,7 +66,7 @@ def test_a_quaternion_turns_a_joint_as_its_rpy(tmp_path, caplog, joint):
 def test_a_quaternion_turns_an_inertia_as_its_rpy(tmp_path):
     def inertia(origin):
         text = HEAVY.replace("<inertial>", f"<inertial><origin {origin}/>")
-        return read_urdf_robot(write(tmp_path, text, "arm.urdf"), "").links.inertia
+        return links_of(tmp_path, text)[0].inertia
 
     turn = " ".join(map(repr, Rotation.from_euler("xyz", [0.4, -0.3, 1.1]).as_quat().tolist()))
     np.testing.assert_allclose(inertia(f'quat_xyzw="{turn}"'), inertia('rpy="0.4 -0.3 1.1"'), atol=1e-12)
@@ -211,6 +219,13 @@ def test_a_limit_that_is_given_is_kept_and_any_other_is_said(tmp_path, caplog, l
     assert re.search(said, caplog.text.strip())
 
 
+def test_six_velocities_in_degrees_are_one_remark(tmp_path, caplog):
+    chain = chain_of(tmp_path, ODD.replace('velocity="2"', 'velocity="180"'))
+    _limits([link.joint for link in chain.joints])
+    assert "of a URDF are in rad/s: joint_1, joint_2, joint_3, joint_4" in caplog.text
+    assert len(caplog.records) == 1
+
+
 @pytest.mark.parametrize(
     ("limit", "message"),
     [
@@ -250,6 +265,20 @@ STROKE = '<limit lower="0" upper="0.05" effort="1" velocity="1"/>'
         ([*ARM, PALM, *PAIR], 6, "palm", r"left_f \(prismatic\), right_f \(prismatic\)"),
         ([*ARM, PALM, *(("finger", "revolute", "palm", "tip"),)], 6, "palm", r"finger \(by its name\); #tip would"),
         ([*ARM, PALM, ("gripper_controller", "revolute", "palm", "tip")], 6, "palm", "by its name"),
+        ([*ARM, PALM, ("6", "revolute", "palm", "moving_jaw")], 6, "palm", r"6 \(by its name\); #moving_jaw would"),
+        (
+            [
+                *ARM,
+                PALM,
+                DRIVE,
+                ("l", "revolute", "left", "tip"),
+                ("r", "revolute", "palm", "right", MIMIC),
+                ("rr", "revolute", "right", "end"),
+            ],
+            6,
+            "palm",
+            r"drive \(mimicked by 1\), r \(mimics drive\)",
+        ),
         ([*ARM, PALM, ("gripper_roll", "revolute", "palm", "tip")], 7, "tip", "^$"),
         (
             [*ARM, PALM, *(("a", "revolute", "palm", "x"), ("b", "revolute", "palm", "y"))],
@@ -331,17 +360,25 @@ def test_an_axis_of_the_arm_that_is_not_modelled_is_refused(tmp_path, joints, me
         ('ixx="-0.02" iyy="0.02" izz="0.01"', "inertia must be positive definite"),
     ],
 )
-def test_an_inertia_that_no_body_has_is_remarked_on_and_refused_by_engines(tmp_path, caplog, inertia, message):
+def test_an_inertia_that_no_body_has_is_named(tmp_path, inertia, message):
     plain = '"link_3">' + INERTIAL
     changed = plain.replace('ixx="0.02" iyy="0.02" izz="0.01"', inertia)
-    robot = read_urdf_robot(write(tmp_path, HEAVY.replace(plain, changed), "arm.urdf"), "")
-    assert re.search(f"link 'link_3': {message}.*; the physics engines refuse it", caplog.text)
-    assert re.search(f"link 'link_3': {message}", robot.flaw)
+    _, flaws = links_of(tmp_path, HEAVY.replace(plain, changed))
+    assert len(flaws) == 1
+    assert re.match(f"link 'link_3': {message}", flaws[0])
 
 
-def test_an_engine_does_not_take_a_robot_whose_inertia_no_body_has(tmp_path):
+def test_a_centre_of_mass_in_millimetres_is_named(tmp_path):
+    _, flaws = links_of(tmp_path, HEAVY.replace("<inertial>", '<inertial><origin xyz="0 0 50"/>'))
+    assert flaws[0] == "link 'link_1': its centre of mass is 50 m from joint 'joint_1'"
+    assert links_of(tmp_path, HEAVY)[1] == []
+
+
+def test_an_engine_does_not_take_a_robot_whose_inertia_no_body_has(tmp_path, caplog):
     pytest.importorskip("mujoco")
     text = HEAVY.replace('ixx="0.02"', 'ixx="20000"')
     robot = read_urdf_robot(write(tmp_path, text, "arm.urdf"), "")
+    assert "link 'link_1': no body has" in caplog.text
+    assert "; the physics engines refuse it" in caplog.text
     with pytest.raises(ValueError, match="robot arm: link 'link_1': no body has"):
         MUJOCO.build(configure(RenderedConfig), replace(setup(), nominal=robot))
