@@ -2,6 +2,7 @@
 
     make tables
 
+It also stores the strings below the fields of settings, for installations without sources.
 A generated part of a page is everything between two comments, of which the first says what belongs there:
 
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
@@ -35,6 +36,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import json
 import os
 import re
 import sys
@@ -51,8 +53,10 @@ from servobench.fmus.export import arm_layout
 from servobench.harness.cli.main import command_line
 from servobench.harness.config import registry
 from servobench.harness.config.description import describe_settings, toml
+from servobench.harness.config.installation import CODE_FOLDERS
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.metrics import METRICS
+from servobench.plant.contract.settings import STORED_STRINGS, strings_in
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -74,6 +78,19 @@ def main() -> None:
     """Write every generated part of every page anew."""
     for page in PAGES:
         page.write_text(renewed(page), encoding="utf-8")
+    STORED_STRINGS.write_text(field_strings_of_package(), encoding="utf-8")
+
+
+def field_strings_of_package() -> str:
+    """Return the strings below fields as JSON by class and field, for installations without sources."""
+    found = {}
+    for folder in CODE_FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            module = ".".join(("servobench", *path.relative_to(ROOT).with_suffix("").parts))
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if strings := strings_in(node):
+                    found[f"{module.removesuffix('.__init__')}.{node.name}"] = strings
+    return json.dumps(found, indent=1, ensure_ascii=False) + "\n"
 
 
 def renewed(page: Path) -> str:

@@ -27,7 +27,7 @@ from servobench.plant.robot.ur5 import UR5
 MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
 PACKAGES: Final = tuple(Path(__file__).parents[1] / name for name in ("fmus", "plant"))
-SOURCES: Final = {".py", ".c", ".h", ".html", ".txt"}
+SOURCES: Final = {".py", ".pyc", ".c", ".h", ".html", ".txt"}  # .pyc of an installation without .py
 STEP: Final = 0.05  # [s] of the default experiment
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
@@ -124,7 +124,8 @@ def fingerprint(options: ExportOptions) -> str:
     digest = hashlib.sha256(repr(parts).encode())
     for name, values in parameters_of(options.setup, options.config).items():
         digest.update(name.encode() + np.asarray(values).tobytes())
-    for path in sorted(path for folder in PACKAGES for path in folder.rglob("*") if path.suffix in SOURCES):
+    files = (path for folder in PACKAGES for path in folder.rglob("*") if path.suffix in SOURCES)
+    for path in sorted(path for path in files if path.parent.name != "__pycache__"):
         digest.update(str(path.relative_to(PACKAGES[0].parent)).encode() + path.read_bytes())
     return digest.hexdigest()[:32]
 

@@ -14,6 +14,7 @@ Rules across fields stand in `__post_init__` and raise `ValueError`. Validation 
 import ast
 import difflib
 import inspect
+import json
 import logging
 import math
 import operator
@@ -127,6 +128,7 @@ _BOUNDS = {
     "less_than": ("lt", "below", operator.lt),
     "less_than_equal": ("le", "at most", operator.le),
 }
+STORED_STRINGS: Final = Path(__file__).parents[1] / "data" / "field_strings.json"
 UNIT: Final = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # the begin of a string below a field
 _WANTED = {
     "finite_number": "finite",
@@ -270,18 +272,35 @@ def _unit(kind: type, key: str) -> str:
 @cache
 def field_strings(kind: type[Any]) -> dict[str, str]:
     """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
-    strings = {}
+    strings: dict[str, str] = {}
     for each in reversed(kind.__mro__[:-1]):
         try:
             source = inspect.getsource(each)
-        except (OSError, TypeError):  # the class was typed in, or is not written in Python
+        except (OSError, TypeError):  # The class was typed in, is not written in Python, or came without its source.
+            strings |= _stored_strings().get(f"{each.__module__}.{each.__qualname__}", {})
             continue
-        definition = ast.parse(textwrap.dedent(source)).body[0]
-        for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
-            match item, below:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    strings[name] = " ".join(text.split())
+        strings |= strings_in(ast.parse(textwrap.dedent(source)).body[0])
     return strings
+
+
+def strings_in(definition: ast.stmt) -> dict[str, str]:
+    """Return the strings below the fields of a class in its syntax tree, as one line each, by field."""
+    strings = {}
+    for item, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
+        match item, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                strings[name] = " ".join(text.split())
+    return strings
+
+
+@cache
+def _stored_strings() -> dict[str, dict[str, str]]:
+    """Return the strings of the classes of this package by class and field, for an installation without sources.
+
+    `make tables` stores them.
+    """
+    stored: dict[str, dict[str, str]] = json.loads(STORED_STRINGS.read_text(encoding="utf-8"))
+    return stored
 
 
 def check_field(name: str, kind: type[Any], key: str, given: object) -> Any:  # noqa: ANN401 - any setting

@@ -116,7 +116,10 @@ def test_the_fingerprint_changes_with_whatever_an_fmu_is_made_from(monkeypatch, 
         with (package / changed).open("a") as file:
             file.write("\n")
         others.append(fingerprint(ExportOptions(2)))
-    assert len({plain, *others}) == 9
+    for compiled in ("an installation without sources", "its next version"):
+        (packages[1] / "kinematic.pyc").write_text(compiled)
+        others.append(fingerprint(ExportOptions(2)))
+    assert len({plain, *others}) == 11
 
 
 EXPORT = """

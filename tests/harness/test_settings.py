@@ -1,10 +1,13 @@
 """Settings: assignments, files, tuned values in place of the defaults of the classes, and refusals in one line."""
 
+import inspect
+import json
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import pytest
 
+import generated_tables
 from kit.own import write
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_batch
@@ -14,9 +17,11 @@ from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import Settings, default_config, flatten, read_settings, tuned_file
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve_sections
+from servobench.plant.contract import settings as contract
 from servobench.plant.contract.checks import check_number
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.settings import Positive, nested, settings
+from servobench.plant.contract.settings import Positive, nested, override, settings
+from servobench.plant.kinematic import KinematicConfig
 
 
 @settings
@@ -174,3 +179,22 @@ def test_dotted_keys_are_settings_of_nested_sections():
     assert given.resolve("outer", Outer()) == Outer(count=4, inner=Inner(3.0, "two"))
     with pytest.raises(ConfigurationError, match=r"settings give 'inner' and also 'inner\.gain', a part of it"):
         Settings({"outer": {"inner.gain": 3.0, "inner": {"kind": "two"}}})
+
+
+def test_units_are_known_without_the_sources(monkeypatch):
+    stored = contract._stored_strings()
+    assert json.loads(generated_tables.field_strings_of_package()) == stored, "make tables stores them"
+    with_sources = contract.field_strings.__wrapped__(KinematicConfig)
+
+    def refuse(_):
+        raise OSError("could not get source code")
+
+    monkeypatch.setattr(inspect, "getsource", refuse)
+    contract.field_strings.cache_clear()
+    contract._unit.cache_clear()
+    try:
+        assert contract.field_strings(KinematicConfig) == with_sources
+        assert override("kinematic", KinematicConfig(), {"lag": "80ms"}).lag == 0.08
+    finally:
+        contract.field_strings.cache_clear()
+        contract._unit.cache_clear()
