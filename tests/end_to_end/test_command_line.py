@@ -25,6 +25,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(output_of, tmp_path):
     assert manifest["configuration"]["exp2"]["duration"] == 3
     assert manifest["seeds"] == "3"
     assert manifest["packages"]["numpy"]
+    assert manifest["blas"][0]["name"]
     figures = {path.stem for path in (out / "figures").glob("*.png")}
     assert len(figures) == len(list((out / "figures").iterdir())) == 6
     assert not (out / "report.html").exists()
