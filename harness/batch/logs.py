@@ -14,13 +14,16 @@ from servobench.harness.config.registry import MAPPED
 from servobench.harness.config.settings import Settings, flatten, nest
 from servobench.harness.run.request import OWN_ROBOT, RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sections
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.files import numbers_of, read_table
+from servobench.plant.contract.files import TIME, numbers_of, read_table
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
 
 TABLES: Final = (".csv", ".parquet")  # suffixes
 MAX_PERIOD: Final = 2.0  # [s] between rows of a log
+FIT_MARGIN: Final = 1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
+PER_SECOND: Final = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
 TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
 CODE: Final = re.compile(rf"^{re.escape(MAPPED)}|\.(?i:py)(:|$)")  # in names of plants, controllers and set-ups
@@ -132,18 +135,42 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
 
 def _period(path: Path, table: pd.DataFrame) -> float:
     """Return the control period [s] of a log, the mean distance of its rows; refuse rows at other distances."""
-    times = numbers_of(f"log {path}", table, ["time_s"])[:, 0]
+    times = numbers_of(f"log {path}", table, [TIME])[:, 0]
     steps = np.diff(times)
     usual = float(np.median(np.abs(steps[steps != 0.0]))) if steps.any() else 0.0
     if not 0.0 < usual <= MAX_PERIOD:
-        needed = "it needs two or more, and time_s in s, not in ms"
+        units = [f"{unit}: divide it by {count:g}" for unit, count in PER_SECOND.items() if 1e-3 <= usual / count < 1.0]
+        needed = f"it needs two or more, and time_s in s, not in {next(iter(units), 'ms')}"
         raise ConfigurationError(f"log {path} has {len(times)} rows, {usual:g} s apart; {needed}")
     mean, tolerance = float(np.mean(steps)), min(TIME_TOLERANCE, usual / 8.0)
     late = np.abs(times - times[0] - mean * np.arange(len(times))) > tolerance
-    uneven = [*(np.flatnonzero(np.abs(steps - usual) > 2.0 * tolerance) + 1), *np.flatnonzero(late)]
-    if uneven:
-        found = f"log {path}: row {uneven[0]} is {steps[uneven[0] - 1]:g} s after the row before, and rows must be the"
-        remedy = "sort them, leave out doubled ones, or resample the log at equal steps"
-        raise UnevenRows(f"{found} control period of {usual:g} s apart: {remedy}")
+    rounding = 0.1 * tolerance
+    if late.any() or (np.abs(steps - usual) > 2.0 * tolerance).any():
+        mean = _fitted_period(path, times, tolerance)
+        rounding = tolerance
     digits = (round(mean, count) for count in range(3, 12))
-    return next((each for each in digits if abs(each - mean) * len(steps) < 0.1 * tolerance), mean)
+    return next((each for each in digits if abs(each - mean) * len(steps) < rounding), mean)
+
+
+def _fitted_period(path: Path, times: FloatArray, tolerance: float) -> float:
+    """Return the period [s] of a clock whose stamps are off by a `tolerance` [s] at most; else say what they are."""
+    steps, rows = np.diff(times), np.arange(len(times))
+    usual = float(np.median(times[2:] - times[:-2])) / 2.0
+    period, begin = np.polyfit(rows, times - times[0], 1).tolist()
+    off = np.abs(times - times[0] - begin - period * rows)
+    if steps.min() > 0.0 and off.max() <= FIT_MARGIN * tolerance:
+        return float(period)
+    row = int(np.argmax(off))
+    found = f"and stamps are up to {1e3 * off.max():.2g} ms off equal steps of {period:.4g} s"
+    remedy = f"if the rows are equally spaced, write {period:.4g} s times the row as time_s, else resample the log"
+    if steps.min() <= 0.0:
+        row = int(np.argmax(steps <= 0.0)) + 1
+        found = f"and rows must be the control period of {usual:.4g} s apart"
+        remedy = "sort them, or leave out doubled ones"
+    elif steps.max() > 1.5 * usual:
+        row = int(np.argmax(steps > 1.5 * usual)) + 1
+        periods = round(steps[row - 1] / usual)
+        found = f"which is {periods} control periods of {usual:.4g} s, so that rows are lost"
+        remedy = "add them with feature_valid = 0 and joints in between, or resample the log at equal steps"
+    before = f"row {row} is {steps[max(row, 1) - 1]:.4g} s after the row before"
+    raise UnevenRows(f"log {path}: {before}, {found}: {remedy}")

@@ -172,8 +172,22 @@ def _moved(log: Log, model: RobotModel) -> str:
             row = rows[(int(growth.argmax()) + 1) * len(rows) // PARTS]
             size, unit = float(np.median(errors[(rows - row) * way >= 0])), log.spec.feature.unit
             jump = f"features jump by {size:.2g} {unit} about {log.time[row]:.0f} s after the begin"
-            return f"{jump}: the camera or the ball was moved; cut the log there"
+            shift = _shift(log, model, log.time[row])
+            if abs(shift) > 0.5 * log.spec.period:
+                frames = f"frames come {1e3 * shift:+.0f} ms later from there on, as where one is lost or doubled"
+                return f"{jump}: {frames}; cut the log there, or shift them"
+            return f"{jump}: the camera or the ball was moved, or a frame is lost; cut the log there"
     return ""
+
+
+def _shift(log: Log, model: RobotModel, time: float) -> float:
+    """Return by how much the latency grows at a time [s]; 0 where a side has too few frames to tell it."""
+    sides = (log.time < time, log.time >= time)
+    parts = [log._replace(valid=log.valid & side) for side in sides]
+    if min(len(frames_of(part)) for part in parts) < MIN_FRAMES:
+        return 0.0
+    before, after = (identify(part, model).estimate("latency")[0] for part in parts)
+    return after - before
 
 
 def _halves(log: Log) -> Iterator[tuple[Log, int]]:

@@ -27,6 +27,10 @@ TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{
 MAX_TOML: Final = 500_000  # [letters] beside texts and comments
 AROUND_FILE: Final = re.compile("[=:]")  # marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
 MAX_COMMAS: Final = 16  # that a path in a comma-separated list may have
+TIME: Final = "time_s"  # column of a table
+TIME_KINDS: Final = ("m", "M")  # numpy's kinds of durations and dates
+SECONDS: Final = f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
+MAX_NUMBER: Final = 1e30  # beyond which no quantity is, and squares of errors are near the largest number
 PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or whose process was killed
 
 
@@ -131,10 +135,15 @@ def read_text(kind: str, path: Path) -> str:
 
 
 def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as above
-    """Return the table of a Parquet file or else of a CSV file, of which blanks do not count; see `read_toml`."""
+    """Return the table of a Parquet file or else of a CSV file, of which blanks do not count; see `read_toml`.
+
+    Levels of the index that have a name are columns. The name of a column in several levels is the last of them.
+    """
     import pandas as pd  # noqa: PLC0415 - lists of names start without it
 
-    text = None if path.suffix.lower() == ".parquet" else read_text(kind, path)
+    text = None
+    if path.suffix.lower() != ".parquet":
+        text = read_text(kind, path)
     header = (text or ",").partition("\n")[0].strip()
     if "," not in header and (marks := [mark for mark in (";", "\t", " ") if mark in header]):
         raise ConfigurationError(
@@ -144,7 +153,23 @@ def read_table(kind: str, path: Path) -> Any:  # noqa: ANN401 - a DataFrame, as 
         table = pd.read_parquet(path) if text is None else pd.read_csv(io.StringIO(text), skipinitialspace=True)
     if text is not None and type(table.index) is not pd.RangeIndex:  # the first cells were taken for names of rows
         raise ConfigurationError(f"{kind} {path} has rows of more cells than its header; write numbers as 0.5")
-    return table.rename(columns=str.strip)
+    levels = [name for name in table.index.names if name is not None and name not in table]
+    if not levels and table.index.dtype.kind in TIME_KINDS and TIME not in table:
+        raise ConfigurationError(f"{kind} {path} has times as its index without a name; {SECONDS}")
+    if levels:
+        table = table.reset_index(level=levels)
+    names = [_plain_column(name) for name in table]
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"{kind} {path} has two columns {doubled[0]!r}; leave one out")
+    return table.reset_index(drop=True).set_axis(names, axis=1)
+
+
+def _plain_column(name: object) -> str:
+    """Return the name of a column as a text without blanks around it; of several levels the last that is not empty."""
+    if not isinstance(name, tuple):
+        return str(name).strip()
+    texts = [str(part).strip() for part in name]
+    return next(filter(None, reversed(texts)), "")
 
 
 def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # noqa: ANN401 - as above
@@ -159,14 +184,24 @@ def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # no
     lacking = [f"column {name}" for name in names if name not in table] or ["rows"] * table.empty
     if lacking:
         raise ConfigurationError(f"{what} has no {lacking[0]}; it needs {', '.join(names)}")
+    chosen = table[list(names)]
+    for name, kind in chosen.dtypes.items():
+        if kind.kind in (*TIME_KINDS, "c") or isinstance(kind, pd.PeriodDtype):
+            raise ConfigurationError(f"{what}: {name} must be numbers, got {kind}; {SECONDS}")
+        if isinstance(kind, pd.CategoricalDtype):
+            chosen = chosen.astype({name: object})
     with configuration_errors(f"{what} has a number without end: ", OverflowError):
-        told = table[list(names)].replace({"True": 1, "False": 0})  # texts if another cell is no truth
-        values = told.apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
-    if not np.isfinite(values).all():
-        row, column = np.argwhere(~np.isfinite(values))[0].tolist()
+        told = chosen.replace({"True": 1, "False": 0})  # texts if another cell is no truth
+        values = told.apply(pd.to_numeric, errors="coerce").to_numpy(np.float64, na_value=np.nan)
+    within = np.abs(values) < MAX_NUMBER
+    if not within.all():
+        row, column = np.argwhere(~within)[0].tolist()
         cell = str(table[names[column]].iloc[row])
         came = "nothing, or nan" if cell == "nan" else repr(cell)
-        raise ConfigurationError(f"{what}, row {row}: {names[column]} must be a finite number, got {came}")
+        wanted = "a finite number"
+        if np.isfinite(values[row, column]):
+            wanted = f"a number below {MAX_NUMBER:g}"
+        raise ConfigurationError(f"{what}, row {row}: {names[column]} must be {wanted}, got {came}")
     return np.asarray(values)
 
 

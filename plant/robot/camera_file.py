@@ -48,7 +48,7 @@ MAX_PLACE: Final = {"base": 20.0, "flange": 1.0}  # [m] largest coordinate of a 
 MAX_OFF: Final = 0.1  # share of the image by which the principal point is usually off its middle
 MAX_MOVED: Final = 0.5  # share of its distance from the middle by which a distortion usually moves a point
 ENDLESS: Final = 1e6  # [1] r² of a ray that no image shows
-MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] of it from the optical axis
+MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis to it
 ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
 MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
 IN_STEP: Final = 2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
@@ -257,7 +257,9 @@ def _matrix(keys: CameraFile) -> FloatArray:
 def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
     """Return the model of the lens, a key of `LENSES`, and its coefficients."""
     given = keys.distortion
-    values = tuple(given.values()) if isinstance(given, dict) else given
+    values = list(given)
+    if isinstance(given, dict):
+        values = list(given.values())
     lens = SYNONYMS.get(plain_name(keys.distortion_model))
     if lens is None:
         raise ValueError(f"distortion_model {keys.distortion_model!r} is not known; wanted {WANTED}, or none")
@@ -272,7 +274,9 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
     if not lens:
         if count == 4 and any(given):
             remark('distortion of four numbers is k1, k2, p1, p2; of a fisheye, write distortion_model = "equidistant"')
-        lens = "rational_polynomial" if any(given[5:]) else "plumb_bob"
+        lens = "plumb_bob"
+        if any(given[5:]):
+            lens = "rational_polynomial"
     wanted = len(LENSES[lens])
     whole = count >= wanted or not any(given[5:])
     if not whole or any(given[wanted:]) or 0 < count < 4 or (lens == "equidistant" and not count):
@@ -282,7 +286,9 @@ def _lens(keys: CameraFile) -> tuple[str, tuple[float, ...]]:
 
 def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tuple[float, ...]]:
     """Return the model of the lens, empty where the file does not say it, and coefficients that are given by name."""
-    lens = lens or ("rational_polynomial" if {"k4", "k5", "k6"} <= set(given) else "plumb_bob")
+    if not lens and {"k4", "k5", "k6"} <= set(given):
+        lens = "rational_polynomial"
+    lens = lens or "plumb_bob"
     if unknown := sorted(set(given) - set(LENSES[lens])):
         raise ValueError(f"distortion has no coefficient {unknown[0]!r} in {lens}; wanted distortion_model {WANTED}")
     return _least_lens(lens, tuple(given.get(name, 0.0) for name in LENSES[lens]))

@@ -6,9 +6,10 @@ VINS (camodocal), where the fisheye's k₁ … k₄ are k2 … k5, and those of 
 
 import re
 from collections.abc import Mapping
-from itertools import chain
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
 
 from servobench.plant.contract.files import read_text
 from servobench.plant.contract.settings import remark
@@ -29,7 +30,7 @@ FOCAL_NAMES: Final = (("fx", "fy", "cx", "cy"), ("fl_x", "fl_y", "cx", "cy"), ("
 COEFFICIENTS: Final[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE: Final[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
-PARTS: Final = ("projection_parameters", "distortion_parameters")  # of VINS
+PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
 DISTORTION: Final = re.compile(r"dist(?!ance)", re.IGNORECASE)  # in names of keys
 EXPONENT: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
@@ -143,13 +144,12 @@ def _is_distortion(name: str) -> bool:
 
 def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
     """Return the numbers of a matrix as a flat list, and other values as they are."""
-    if isinstance(value, dict):
-        value = value.get("data", [] if "rows" in value or "sizes" in value else value)
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
     if value is None:
         return []
     if isinstance(value, list):
-        rows = [row if isinstance(row, list) else [row] for row in value]
-        return list(chain.from_iterable(rows))
+        return np.array(value, dtype=object).ravel().tolist()
     return value
 
 

@@ -1,4 +1,7 @@
+from decimal import Decimal
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from servobench.harness.run.references import FixedPoint, Laps, Waypoints, line, read_waypoints
@@ -72,3 +75,46 @@ def test_the_columns_of_a_waypoint_file_have_the_unit_of_the_feature(tmp_path):
 def test_a_reference_that_cannot_be_is_refused(kind, arguments, message):
     with pytest.raises(ValueError, match=message):
         kind(*arguments)
+
+
+PLACES = pd.DataFrame({"time_s": [0.0, 2.0, 4.0], "x_m": [0.1, 0.15, 0.1], "y_m": [0.1, 0.1, 0.15], "z_m": [1.2] * 3})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda table: table.set_index("time_s"),
+        lambda table: table.set_index(["time_s", "x_m"]),
+        lambda table: table.set_axis(pd.MultiIndex.from_product([["robot"], table.columns]), axis=1),
+        lambda table: table.set_axis(pd.MultiIndex.from_tuples([(name, "") for name in table]), axis=1),
+        lambda table: table.set_index(pd.Index([3, 1, 2])),
+        lambda table: table.set_index(pd.Index(["a", "b", "c"], name="label")),
+        lambda table: table.map(lambda number: Decimal(f"{number:.3f}")),
+        lambda table: table.astype("category"),
+        lambda table: table.astype("Float64"),
+    ],
+)
+def test_parquet_is_read_as_pandas_writes_it(tmp_path, change):
+    change(PLACES).to_parquet(tmp_path / "way.PARQUET")
+    read = read_waypoints(tmp_path / "way.PARQUET", FEATURE)
+    np.testing.assert_array_equal(read.at([0.0, 1.0, 4.0]), [[0.1, 0.1, 1.2], [0.125, 0.1, 1.2], [0.1, 0.15, 1.2]])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda table: table.set_axis(range(4), axis=1), "way.parquet has no column time_s; it needs time_s, x_m"),
+        (lambda table: table.assign(time_s=pd.to_timedelta(table["time_s"], unit="s")),
+         r"time_s must be numbers, got timedelta64.*total_seconds\(\)"),
+        (lambda table: table.assign(time_s=pd.to_datetime(table["time_s"], unit="s", utc=True)), "got datetime64"),
+        (lambda table: table.set_index(pd.TimedeltaIndex(table.pop("time_s").to_numpy("m8[s]"))),
+         "way.parquet has times as its index without a name; for a column time_s in s"),
+        (lambda table: table.set_axis(["time_s", "x_m", " x_m", "z_m"], axis=1), "has two columns 'x_m'; leave"),
+        (lambda table: table.assign(x_m=[0.1, 1e308, 0.1]), "row 1: x_m must be a number below 1e.30, got '1e.308'"),
+    ],
+)  # fmt: skip
+def test_parquet_that_is_no_table_of_numbers_is_one_line(tmp_path, change, said):
+    change(PLACES.copy()).to_parquet(tmp_path / "way.parquet")
+    with pytest.raises(ValueError, match=said) as caught:
+        read_waypoints(tmp_path / "way.parquet", FEATURE)
+    assert "\n" not in str(caught.value)

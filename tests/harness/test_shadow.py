@@ -147,14 +147,23 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of
     ("change", "message"),
     [
         (lambda table: table.drop(columns="feature_y_m"), "the log has no column feature_y_m; it needs feature_x_m, "),
-        (lambda table: table.drop(index=[5, 50]), "row 5 is 0.1 s after the row before, .*: sort them, .* resample"),
+        (lambda table: table.drop(index=[5, 50]),
+         "row 5 is 0.1 s after .*, which is 2 control periods of 0.05 s, so that rows are lost: add them"),
         (lambda table: table.assign(reference_z_m="near"), "row 0: reference_z_m must be a finite number, got 'near'"),
         (lambda table: table.iloc[:0], "robot.csv has no rows"),
         (lambda table: table.iloc[:1], "has 1 rows, 0 s apart; it needs two or more"),
         (lambda table: table.loc[table.index.repeat(2)],
          "row 1 is 0 s after the row before, .* leave out doubled ones"),
         (lambda table: table.iloc[::-1], "row 1 is -0.05 s after the row before"),
-        (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (table.index == 7)), "row 7 is 0.053 s after"),
+        (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (table.index == 7)),
+         "row 7 is 0.053 s after the row before, and stamps are up to 2.9 ms off equal steps of 0.05 s: if the rows"),
+        (lambda table: table.assign(time_s=table["time_s"] + 0.003 * (-1.0) ** table.index),
+         "up to 3.1 ms off equal steps of 0.05 s"),
+        (lambda table: table.assign(time_s=1e9 * table["time_s"] + 1e14),
+         "5e.07 s apart; .* not in ns: divide it by 1e.09"),
+        (lambda table: table.assign(time_s=1e6 * table["time_s"]), "not in µs: divide it by 1e.06"),
+        (lambda table: table.assign(feature_x_m=table["feature_x_m"].where(table.index != 7, 1e160)),
+         r"row 7: feature_x_m must be a number below 1e\+30, got '1e\+160'"),
         (lambda table: table.assign(time_s=1000.0 * table["time_s"]),
          "has 80 rows, 50 s apart; it needs two or more, and time_s in s, not in ms"),
         (lambda table: table.assign(time_s=[f"{time} s" for time in table["time_s"]]),
@@ -166,6 +175,14 @@ def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(refusal_of
 def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message):
     with pytest.raises(ConfigurationError, match=message):
         show(change(own_log(steps)), tmp_path / "robot.csv")
+
+
+def test_stamps_that_are_off_by_less_than_a_millisecond_are_those_of_equal_steps(steps, tmp_path):
+    table = own_log(steps)
+    noise = np.random.default_rng(5).uniform(-0.0009, 0.0009, len(table))
+    noise[[0, -1]] = 0.0009, -0.0009
+    seen, exact = (show(table.assign(time_s=table["time_s"] + each), tmp_path / "robot.csv") for each in (noise, 0.0))
+    np.testing.assert_array_equal(commands(seen), commands(exact))
 
 
 def test_a_log_whose_clock_counts_from_1970_is_shown_like_one_that_begins_at_0(steps, tmp_path):
