@@ -29,7 +29,7 @@ from servobench.plant.contract.checks import as_array
 from servobench.plant.contract.faults import configuration_errors
 from servobench.plant.contract.settings import JointSpeed, Number, Positive, Usual, override, remark, settings
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
-from servobench.plant.robot.makers import MAX_DEVIATION, nearest_title, read_calibration, universal_robot
+from servobench.plant.robot.makers import known_title, read_calibration, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
@@ -40,10 +40,7 @@ def read_calibrated_robot(path: Path) -> Robot:
     Raises:
         ValueError: the file is missing, malformed, or fits no data sheet.
     """
-    title, deviation = nearest_title(read_calibration(path, np.zeros(3)))
-    if deviation > MAX_DEVIATION:
-        nearest = f"the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away"
-        raise ValueError(f"calibration file {path} fits no arm of Universal Robots: {nearest}")
+    title, deviation = known_title(read_calibration(path, np.zeros(3)), path)
     sheet = universal_robot(title)
     source, measured = f"{path.name}, held against {sheet.source}", read_calibration(path, sheet.arm.tool)
     within = f"its flange within {1e3 * deviation:.1f} mm of the data sheet's"

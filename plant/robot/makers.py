@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.contract.checks import as_array
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.files import read_text, user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
@@ -27,6 +27,7 @@ from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, 
 
 Triple = tuple[float, float, float]
 CALIBRATION_BLOCKS: Final = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+LENGTHS: Final = ("a2", "a3", "d1", "d4", "d5", "d6")  # names of DH lengths that are not 0
 ALIKE: Final = (2, 1, 3)  # joints of shoulder, elbow and wrist that share a number of a `Triple`
 UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
 PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
@@ -122,7 +123,7 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
         other = f"the calibration of one real UR5, and the robot is a {robot.title}"
         raise ValueError(f"mismatch 'factory' without a file is {other}; use factory=FILE with its own")
     arm = read_calibration(None if file is None else user_path(file), robot.arm.tool)
-    title, deviation = nearest_title(arm)
+    title, deviation = known_title(arm, file)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
         other = f"that of a {title} (lengths within {1e3 * deviation:.1f} mm), and the robot is a {robot.title}"
         raise ValueError(
@@ -173,13 +174,48 @@ def nearest_title(arm: SerialArm) -> tuple[str, float]:
     return min(deviations, key=itemgetter(1))
 
 
+def known_title(arm: SerialArm, file: object) -> tuple[str, float]:
+    """Return title and deviation as `nearest_title`, for a calibration `file` of an arm in the catalogue.
+
+    Raises:
+        ValueError: the arm fits no data sheet; it names the lengths of an arm of the same build.
+    """
+    title, deviation = nearest_title(arm)
+    if deviation <= MAX_DEVIATION:
+        return title, deviation
+    found = f"calibration file {file} fits no arm of Universal Robots"
+    lengths, apart = nearest_lengths(arm)
+    if apart <= MAX_DEVIATION:
+        sizes = ", ".join(f"{name} = {length:.4f}" for name, length in zip(LENGTHS, lengths.tolist(), strict=True))
+        looks = "looks like an arm of Universal Robots that is not in the catalogue"
+        found = f"calibration file {file} {looks}: bring its URDF, or a DH table with {sizes} m"
+    raise ValueError(f"{found}; the {title} comes nearest, and its flange is {1e3 * deviation:.0f} mm away")
+
+
+def nearest_lengths(arm: SerialArm) -> tuple[FloatArray, float]:
+    """Return the lengths of the data sheet that an arm fits best, (6,) m, and the deviation of its flange [m].
+
+    The place of the flange is linear in the lengths: p(q) = Σ L_i p_i(q), p_i being that of an arm of length L_i = 1.
+    """
+    places = []
+    for a2, a3, d1, d4, d5, d6 in np.eye(len(LENGTHS)).tolist():
+        unit = arm_from_dh((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), ur5.DH_ALPHA, ur5.JOINT_NAMES)
+        places.append(_flanges(unit).ravel())
+    matrix, own = np.transpose(places), _flanges(arm).ravel()
+    lengths = np.linalg.lstsq(matrix, own, rcond=None)[0]
+    return np.asarray(lengths, dtype=np.float64), float(np.abs(matrix @ lengths - own).max())
+
+
+def _flanges(arm: SerialArm) -> FloatArray:
+    """Return the places of the flange in a few postures, (k, 3) m."""
+    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, arm.n))
+    return np.asarray(arm.frames(postures)[:, -1, :3, 3])
+
+
 def deviation_from(arm: SerialArm, title: str) -> float:
     """Return the largest deviation of a calibrated arm's flange from that of a data sheet [m].
 
     The parallel axes of shoulder lift, elbow and wrist 1 leave the split of d2, d3 and d4 open, so that calibrations
     differ in it by metres and mean the same arm, so arms are compared by the position of the flange in a few postures.
     """
-    nominal = UNIVERSAL_ROBOTS[title].arm()
-    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, nominal.n))
-    own, other = (each.frames(postures)[:, -1, :3, 3] for each in (arm, nominal))
-    return float(np.abs(own - other).max())
+    return float(np.abs(_flanges(arm) - _flanges(UNIVERSAL_ROBOTS[title].arm())).max())

@@ -187,8 +187,18 @@ def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
         sample_mismatch(Mismatch.parse("factory"), find_robot("panda"), 0)
     with pytest.raises(ValueError, match="calibration of one real UR5, and the robot is a UR3e"):
         sample_mismatch(Mismatch.parse("factory"), find_robot("ur3e"), 0)
-    path.write_text(path.read_text().replace("x: -0.6", "x: -0.9"))
-    with pytest.raises(ValueError, match="fits no arm of Universal Robots"):
+    longer = path.read_text().replace("x: -0.6", "x: -0.9")
+    path.write_text(longer)
+    said = (
+        r"looks like an arm of Universal Robots that is not in the catalogue: bring its URDF, or a DH table with a2 = "
+    )
+    said += r"-0\.91\d\d, a3 = -0\.57\d\d, d1 = 0\.18\d\d, .*; the UR10e comes nearest, and its flange is 3\d\d mm away"
+    with pytest.raises(ValueError, match=said):
+        find_robot(str(path))
+    with pytest.raises(ValueError, match=said):  # although the UR10e comes nearest
+        sample_mismatch(Mismatch.parse(f"factory={path}"), find_robot("ur10e"), 0)
+    path.write_text(longer.replace("roll: 1.57", "roll: 0.57", 1))
+    with pytest.raises(ValueError, match="fits no arm of Universal Robots; the"):
         find_robot(str(path))
 
 
