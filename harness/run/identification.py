@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from servobench.controllers.algebra import nearest_rotation
+from servobench.plant.cameras.optics import COLUMNS, locate
 from servobench.plant.cameras.setups import PIXEL, POSITION, SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError
@@ -398,9 +399,14 @@ def _by_pixels(model: SetupModel, joints: FloatArray, features: FloatArray) -> t
 
     matrix, poses, errors = np.eye(3), np.tile(np.eye(4), (len(joints), 1, 1)), np.zeros(len(joints))
     matrix[[0, 1], [0, 1]], matrix[:2, 2] = model.optics.focal_lengths[0], model.optics.centre[0]
+    wide = model.optics.further is not None and model.optics.further.shape[-1] > COLUMNS["plumb_bob"]
     for k, (q, y) in enumerate(zip(joints, features, strict=True)):
         points = np.ascontiguousarray(model.points(q)[:, 0])
-        found, turn, place, _ = cv2.solvePnPRansac(points, y.copy(), matrix, None, reprojectionError=20.0)
+        flat = y.copy()
+        if wide:
+            rays = locate(y[:, None, None], np.ones((len(y), 1, 1)), model.optics)[:, 0, 0]
+            flat = np.ascontiguousarray((rays @ matrix.T)[:, :2])
+        found, turn, place, _ = cv2.solvePnPRansac(points, flat, matrix, None, reprojectionError=20.0)
         if found:
             poses[k, :3, :3], poses[k, :3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
         poses[k] = np.linalg.inv(poses[k]) if found else model.camera

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit import own
+from servobench.harness.run.identification import fit_cameras
 from servobench.plant.cameras.optics import Optics, in_image, locate, project, project_rates
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SetupModel
@@ -133,6 +134,16 @@ def test_wide_lenses_are_those_of_opencv_both_ways_over_the_whole_image(write, l
     y, J, _ = model.observe(q)
     np.testing.assert_allclose(np.asarray(function(q))[:, 0], y, rtol=1e-12)
     np.testing.assert_allclose(casadi.Function("J", [x], [casadi.jacobian(function(x), x)])(q), J, rtol=1e-9, atol=1e-9)
+
+
+def test_the_place_of_a_fisheye_is_found_from_its_pixels(write):
+    lens, coefficients = LENSES[2]
+    model = Sensing.parse("pixel").nominal(robot_with(write(wide_camera(lens, coefficients) + ABOVE)))
+    work = find_robot("ur10e").workspace
+    q = np.random.default_rng(0).uniform(work.lower, work.upper, (60, 6))
+    poses, errors = fit_cameras(model, q[None], model.feature(q))
+    assert errors[0] < 1e-3
+    np.testing.assert_allclose(poses[0], model.camera, atol=1e-5)
 
 
 @pytest.mark.parametrize(
