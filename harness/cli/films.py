@@ -12,7 +12,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Value, named_option, option
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def record(
     wanted = selection.split_names("kinds", kinds if film is None else film.suffix.removeprefix("."), KINDS)
     into = (out or (folder or Path("results")) / RECORDINGS) if film is None else film.parent
     _check_writable(into)
-    with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
+    with telling(console, "reading" if folder else "running") as tell:
         shown = _shown(folder, run, new)
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
         stem = into / str(shown.track.row["run_id"]) if film is None else film.with_suffix("")

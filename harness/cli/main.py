@@ -18,7 +18,7 @@ from servobench.harness.cli import authoring, lists, results, runs, studies
 from servobench.harness.cli.films import record
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.options import ABSENT, command
-from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
+from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED, ending_alike
 from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import harmless
 
@@ -113,13 +113,17 @@ def in_known_number(root: Any, words: list[str]) -> list[str]:  # noqa: ANN401 -
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
+    with ending_alike() as caught:
+        _carry_out(caught)
+
+
+def _carry_out(caught: list[int]) -> None:
+    """Run the command line; `caught` gets the signals that end it."""
     if sys.__stderr__ is not None:
         with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
             faulthandler.enable(sys.__stderr__)  # a segmentation fault, as of a plug-in, prints the line that it was in
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # `µ` where the encoding of the terminal lacks it
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as below `&` of a script and in some CI
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.pop("MPLBACKEND", None)  # nothing is drawn in a window, and Matplotlib takes no unknown one
     if not (epoch := os.environ.get("SOURCE_DATE_EPOCH") or "0").isdecimal():
         _end(f"SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, got {epoch!r}; unset it")
@@ -146,7 +150,7 @@ def main() -> None:
         sys.stderr.write(f"servobench: {line}{_resuming()}\n")
         code = FAILED
     if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that keep something say so by themselves
-        sys.stderr.write("servobench: interrupted\n")
+        sys.stderr.write(f"servobench: {'terminated' if signal.SIGTERM in caught else 'interrupted'}\n")
     sys.exit(code)
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FAILED = 1  # exit code where a run failed, a check was not passed or answers are different
 INPUT_ERROR = 2  # exit code
 INTERRUPTED = 130  # exit code after Ctrl-C
-TERMINATED = 128 + signal.SIGTERM  # exit code
+SOON = 0.05  # [s] until an interrupt comes again that a destructor has dropped
 
 # The first columns, by which a row is known.
 KEYS = ("controller", "mismatch", "noise factor", "latency [ms]", "period [ms]", "A − B")
@@ -47,18 +47,46 @@ console = Terminal(emoji=False)  # `pixel:hand:` is none
 
 
 @contextlib.contextmanager
-def cleaning_up_when_terminated() -> Iterator[None]:
-    """Let SIGTERM end the command as Ctrl-C does, such that nothing half written and no other program is left."""
+def ending_alike() -> Iterator[list[int]]:
+    """Let SIGTERM and SIGHUP end the command as Ctrl-C does, such that nothing half written and no process is left.
 
-    def stop(_number: int, _frame: object) -> NoReturn:
-        sys.stderr.write("servobench: terminated\n")
-        raise SystemExit(TERMINATED)
+    One of them that was ignored on entry, as below nohup, stays ignored. An interrupt that comes in a destructor, where
+    Python drops it, comes again. The exit code is that of the signal.
 
-    before = signal.signal(signal.SIGTERM, stop)
+    Yields:
+        The signals that came.
+    """
+    caught: list[int] = []
+    dropped: list[object] = []
+    hook = sys.unraisablehook
+
+    def interrupt(number: int, _frame: object) -> NoReturn:
+        caught.append(number)
+        raise KeyboardInterrupt
+
+    def report(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            hook(unraisable)
+            return
+        dropped.append(unraisable.exc_type)
+        signal.setitimer(signal.ITIMER_REAL, SOON)
+
+    taken = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) != signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in taken}
+    for number in (signal.SIGINT, signal.SIGALRM):  # asyncio knows Ctrl-C by the usual handler
+        before[number] = signal.signal(number, signal.default_int_handler)
+    sys.unraisablehook = report
     try:
-        yield
+        yield caught
+    except SystemExit as stop:
+        if stop.code != INTERRUPTED and not dropped:
+            raise
+        raise SystemExit(128 + (caught or [signal.SIGINT])[0]) from None
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        sys.unraisablehook = hook
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def print_rows(headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:

@@ -1,0 +1,74 @@
+"""Signals end a command as Ctrl-C does, wherever they meet it, and its temporary files with it."""
+
+import os
+import signal
+import sys
+
+import pytest
+
+from kit.command import finish, start, wait_for
+from kit.folders import comparison
+from servobench.harness.cli.terminal import ending_alike
+
+USUAL = signal.getsignal(signal.SIGINT)
+
+
+class Dropping:
+    """An object in whose destructor a signal comes, where Python drops what it raises."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self.number)
+
+
+def end(number: int, *, waits: bool) -> None:
+    """Be a command in which a destructor drops a signal; it waits for another, or ends as if nothing had come."""
+    with ending_alike():
+        try:
+            Dropping(number).number = number
+            while waits:
+                signal.pause()
+        except KeyboardInterrupt:
+            sys.exit(130)
+        sys.exit(0)
+
+
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_that_a_destructor_drops_ends_the_command(name, waits, capsys):
+    number = signal.Signals[name]
+    with pytest.raises(SystemExit) as stop:
+        end(number, waits=waits)
+    assert stop.value.code == 128 + number
+    assert "Exception ignored" not in capsys.readouterr().err
+    assert signal.getsignal(number) == (USUAL if number == signal.SIGINT else signal.SIG_DFL)
+
+
+def test_signals_that_were_ignored_on_entry_stay_ignored_but_ctrl_c():
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGHUP, signal.SIGINT)}
+    try:
+        with ending_alike() as caught:
+            signal.raise_signal(signal.SIGHUP)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert caught == []
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_looks_whole(name, tmp_path):
+    folder = comparison(tmp_path / "folder", tuple(f"c{k}" for k in range(150)), ("exp1",))
+    (tmp_path / "temporary").mkdir()
+    process = start("export", str(folder), "--out", str(tmp_path / "csv"), TMPDIR=str(tmp_path / "temporary"))
+    wait_for(lambda: any(tmp_path.glob("*csv*")) or process.poll() is not None)
+    os.kill(process.pid, signal.Signals[name])
+    code, output = finish(process)
+    assert code == 128 + signal.Signals[name], output
+    assert output.splitlines()[-1] in ("servobench: terminated", "servobench: interrupted")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["folder", "temporary"]
+    assert not any((tmp_path / "temporary").iterdir())
