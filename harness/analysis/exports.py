@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 from collections.abc import Hashable, Mapping
 from functools import partial
 from importlib.metadata import version
@@ -15,7 +14,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing, write_atomically, write_csv
+from servobench.plant.contract.files import accessing, write_atomically, write_csv, writing_together
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
@@ -47,12 +46,9 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
     with accessing(out):
         if out.exists():
             raise ConfigurationError(f"{out} exists already; name a new folder")
-        out.mkdir(parents=True)
-    try:
-        return _write_runs(folder, runs, out, kind)
-    except BaseException:
-        shutil.rmtree(out, ignore_errors=True)
-        raise
+        with writing_together(out) as partial:
+            files = _write_runs(folder, runs, partial, kind)
+    return [out / path.name for path in files]
 
 
 def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[Path]:

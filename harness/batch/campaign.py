@@ -46,6 +46,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, Sections, check_settings, resolve_sections, select
 from servobench.harness.run.result import RunResult
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import writing_together
 from servobench.plant.contract.settings import remark
 
 Row = dict[str, Any]
@@ -270,10 +271,11 @@ def merge(folders: Sequence[Path], out: Path, note: Callable[[str], None]) -> in
         if others.start < runs.stop:
             raise ConfigurationError(f"{folder} and {other} have the same runs: leave one away")
     refuse_nameless(out, pd.concat(tables, ignore_index=True))
-    with locked(out):
-        results.create_folder(out, manifest)
-        results.copy_parts(((folder, runs.start) for runs, folder in found), out)
-        return results.put_together(out, manifest)
+    check_empty(out)
+    with writing(out), writing_together(out) as partial:
+        results.create_folder(partial, manifest)
+        results.copy_parts(((folder, runs.start) for runs, folder in found), partial)
+        return results.put_together(partial, manifest)
 
 
 def _jobs(campaign: Campaign, sections: Sections, together: bool, indices: Iterable[int]) -> Iterator[Job]:

@@ -14,6 +14,7 @@ from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Value, named_option, option
 from servobench.harness.cli.terminal import console, say
 from servobench.plant.contract.faults import ConfigurationError
+from servobench.plant.contract.files import writing_together
 
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
@@ -81,9 +82,12 @@ def record(
     with telling(console, "reading" if folder else "running") as tell:
         shown = _shown(folder, run, new)
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
-        stem = into / str(shown.track.row["run_id"]) if film is None else film.with_suffix("")
-        paths = write_recording(stretch(shown, begin, length), stem, wanted, tell)
-    for path in paths:
+        name = str(shown.track.row["run_id"])
+        if film is not None:
+            name = film.stem
+        with writing_together(into) as partial:
+            made = write_recording(stretch(shown, begin, length), partial / name, wanted, tell)
+    for path in [into / each.name for each in made]:
         say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 

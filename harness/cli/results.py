@@ -13,7 +13,7 @@ from servobench.harness.cli import selection
 from servobench.harness.cli.options import JsonOption, named_option, option, switch
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import accessing
+from servobench.plant.contract.files import accessing, writing_together
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,10 +123,10 @@ def figures(
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
     files: list[Path] = []
-    with console.status("drawing the figures"):
+    with console.status("drawing the figures"), accessing(target), writing_together(target) as partial:
         for named in folder_figures(folder, choice):
-            with accessing(target):
-                files += save_figure(named.figure, target / named.stem, formats, exact_width=True)
+            made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)
+            files += [target / path.name for path in made]
     if not files:
         results.check_steps(folder)
         raise ConfigurationError(

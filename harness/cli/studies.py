@@ -350,7 +350,7 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.contract.files import accessing, write_csv
+    from servobench.plant.contract.files import accessing, write_csv, writing_together
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
@@ -367,11 +367,10 @@ def analyse(
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    with accessing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        write_csv(table, out / TABLE)
-        text = printed(table)
-        page = write_pictures(out, loops, text, LEGEND)[0]
+    text = printed(table)
+    with accessing(out), writing_together(out) as partial:
+        write_csv(table, partial / TABLE)
+        page = out / write_pictures(partial, loops, text, LEGEND)[0].name
     identified = ", ".join(loop.name for loop in loops if loop.model == "identified")
     title = f"Loops at rest, estimators frozen at the {jacobian} Jacobian"
     title += f"; identified in small motions: {identified}" * bool(identified)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import shutil
 import threading
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
@@ -55,6 +56,42 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         if partial.exists():  # not below a file, for instance
             partial.unlink()
+
+
+@contextmanager
+def writing_together(folder: Path) -> Iterator[Path]:
+    """Yield a new folder for files that belong together; they get their places in `folder` once all of them are there.
+
+    A folder that is new gets its name at once; in one that is there, files of the same names are replaced.
+    """
+    partial = partial_path(folder / "files")
+    if not folder.exists():
+        partial = partial_path(folder)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if partial.parent != folder and any(partial.iterdir()):
+            partial.rename(folder)
+            return
+        for path in sorted(partial.rglob("*")):
+            place = folder / path.relative_to(partial)
+            if path.is_dir():
+                place.mkdir(exist_ok=True)
+            else:
+                path.replace(place)
+    except OSError as error:
+        _name_whole(error, partial, folder)
+        raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _name_whole(error: OSError, partial: Path, whole: Path) -> None:
+    """Let an error name the file or folder of the user in place of one that is being written."""
+    if error.filename is not None:
+        error.filename = str(error.filename).replace(str(partial), str(whole))
+    if error.strerror is not None:
+        error.strerror = error.strerror.replace(str(partial), str(whole))
 
 
 @contextmanager
