@@ -3,12 +3,13 @@
 The checks are those of the archive and the description (by fmpy), and a run against the reference inside it.
 """
 
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from fmpy.validation import validate_fmu as validate_by_fmpy
@@ -16,11 +17,19 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
-from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import FmuDescription, Variable, parse_description, read_description
+from servobench.plant.fmu.archive import DESCRIPTION, extract_fmu
+from servobench.plant.fmu.description import (
+    IDENTIFIER,
+    FmuDescription,
+    Variable,
+    parse_description,
+    read_description,
+    read_time,
+)
 from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
 
+MAX_START: Final = 1e12  # [s] A larger clock loses steps of milliseconds.
 TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
 
 
@@ -82,6 +91,7 @@ class Validation:
     """Result of the checks."""
 
     problems: tuple[str, ...]  # one line for each; empty if there are none
+    departures: tuple[str, ...]  # from the standard, one line for each, with which it runs here nevertheless
     deviation: float | None  # largest difference from the reference run, or None without a reference run
 
 
@@ -93,7 +103,8 @@ def validate_fmu(path: Path) -> Validation:
     """
     root = extract_fmu(path)
     description = read_description(path, root)
-    problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+    departures = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+    problems = [*_odd_times(root), *_odd_names(root)]
     deviation = None
     referenced = (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file()
     try:
@@ -106,7 +117,37 @@ def validate_fmu(path: Path) -> Validation:
         problems.append(f"{'the reference run failed' if referenced else 'it cannot be made ready for a run'}: {error}")
     if deviation is not None and not deviation <= TOLERANCE:
         problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
-    return Validation(tuple(problems), deviation)
+    return Validation(tuple(problems), tuple(departures), deviation)
+
+
+def _odd_times(root: Path) -> Iterator[str]:
+    """Yield what is wrong with the times and the tolerance of the default experiment."""
+    experiment = "DefaultExperiment"
+    start = read_time(root, experiment, "startTime", 0.0)
+    stop = read_time(root, experiment, "stopTime", max(start, 0.0) + 1.0)
+    step = read_time(root, experiment, "stepSize", 1e-3)
+    tolerance = read_time(root, experiment, "tolerance", 1e-3)
+    if not abs(start) < MAX_START:
+        yield f"startTime of the default experiment must be within {MAX_START:g} s, got {start:g}"
+    if not start < stop < math.inf:
+        yield f"stopTime of the default experiment must be later than startTime, {start:g}, got {stop:g}"
+    if not 0.0 < step < math.inf:
+        yield f"stepSize of the default experiment must be above 0, got {step:g}"
+    if not 0.0 < tolerance < math.inf:
+        yield f"tolerance of the default experiment must be above 0, got {tolerance:g}"
+
+
+def _odd_names(root: Path) -> Iterator[str]:
+    """Yield identifiers that are no names of a library, of every interface, and names of files that no one can type."""
+    description = ET.parse(root / DESCRIPTION).getroot()
+    for tag, name in INTERFACES.items():
+        for element in description.findall(tag):
+            identifier = element.get("modelIdentifier", "")
+            if not IDENTIFIER.fullmatch(identifier):
+                yield f"modelIdentifier of {name} must be the name of a library, without folders, got {identifier!r}"
+    for file in root.rglob("*"):
+        if not file.name.isprintable():
+            yield f"the name of a file must have printable letters, got {str(file.relative_to(root))!r}"
 
 
 def _deviation(description: FmuDescription) -> float:

@@ -213,14 +213,14 @@ def validate(path: Path) -> Validation:
 
     answer, failure = attempt(_validate, path, limit=FOREIGN_TIME, why=lambda end, _: end.reason, quiet=False)
     match answer:
-        case [list(problems), float() | None as deviation]:
-            return Validation(tuple(map(str, problems)), deviation)
-    return Validation((f"the reference run ended: {failure or 'it gave no answer'}",), None)
+        case [list(problems), list(departures), float() | None as deviation]:
+            return Validation(tuple(map(str, problems)), tuple(map(str, departures)), deviation)
+    return Validation((f"the reference run ended: {failure or 'it gave no answer'}",), (), None)
 
 
-def _validate(path: Path) -> tuple[Sequence[str], float | None]:
+def _validate(path: Path) -> tuple[Sequence[str], Sequence[str], float | None]:
     from servobench.fmus.inspection import validate_fmu  # noqa: PLC0415 - as above
 
     with configuration_errors("", FmuError):
         found = validate_fmu(path)
-    return found.problems, found.deviation
+    return found.problems, found.departures, found.deviation

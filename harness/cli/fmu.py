@@ -140,13 +140,19 @@ def validate(file: FileArgument) -> None:
     found = validate(file)
     for problem in found.problems:
         say(f"problem: {problem}")
+    ran = ", runs nevertheless"
+    if found.problems:
+        ran = ""
+    for departure in found.departures:
+        say(f"breaks the standard here{ran}: {departure}")
     if found.deviation is None:
         say("no reference run inside" + ("" if found.problems else "; it was loaded and made ready for a run"))
     else:
         say(f"reference run: largest difference {found.deviation:.2g}")
     if found.problems:
         raise typer.Exit(FAILED)
-    say("no problem found")
+    if not found.departures:
+        say("no problem found")
 
 
 @fmu_app.command()
