@@ -28,6 +28,7 @@ from servobench.plant.contract.settings import listed
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
+DEFAULT_MISMATCH: Final = "moderate"  # On plants with robots of their own it stands for none.
 MAX_SEEDS: Final = 1_000_000  # of a batch
 MAX_SEED: Final = 2**63 - 1  # which the tables hold
 MAX_SHOWN: Final = 200  # [characters] of a given text, in a message
@@ -50,8 +51,12 @@ class Batch:
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
+        is_default = self.mismatches == (DEFAULT_MISMATCH,)
+        own = {plant for plant in self.plants if is_default and find_plant(plant).own_robot}
 
         def run(sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
+            if plant in own:
+                mismatch = Mismatch()
             return RunRequest(plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing)
 
         mismatches = [read_mismatch(text) for text in self.mismatches]

@@ -235,7 +235,10 @@ def _plant_of_class(given: type[Any]) -> PlantEntry:
     if issubclass(given, World):
         build, default = Guarded(partial(on_bench, given, config is not None), Plant), BenchSettings
     own_robot = bool(given.own_robot)
-    return PlantEntry(given.__name__, summary_of(given), config or default, build, own_robot=own_robot)
+    no_model = own_robot and given.nominal_jacobian is Plant.nominal_jacobian
+    return PlantEntry(
+        given.__name__, summary_of(given), config or default, build, own_robot=own_robot, no_model=no_model
+    )
 
 
 def _checked_plant(entry: PlantEntry, place: str) -> PlantEntry:

@@ -15,7 +15,7 @@ from servobench.harness.config.registry import engine_of
 from servobench.harness.config.settings import Settings
 from servobench.harness.config.source import same_folder
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw
+from servobench.harness.run.experiment import Drawn, Experiment, build, build_together, draw, naming_the_lack
 from servobench.harness.run.knowledge import keep_networks
 from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.log import StepLog, Steps
@@ -58,7 +58,8 @@ def carry_out(
     with same_folder(), contextlib.closing(experiment.plant) as plant, careful():
         try:
             pair = held_to_contract(plant, experiment.controller)
-            run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
+            with naming_the_lack(plant, own_robot=experiment.drawn.true is None):
+                run_loop(*pair, experiment.desired(), experiment.loop, resolved.request.seed, log)
         except BaseException as error:
             if ends_batch(error) or (debug and not isinstance(error, RunFault)):
                 raise

@@ -8,7 +8,8 @@ run is refused only where no true robot of that mismatch could do it.
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final
@@ -259,11 +260,26 @@ def _assemble(
             knowledge, trained = nominal_knowledge(robot, nominal, plant.spec, run)
         source = network_source(trained, progress)
         true_model = plant.true_model if true is None else lambda: plant.with_delays(_equations(true))
-        controller = _build_controller(resolved, replace(knowledge, train=source), true_model)
+        with naming_the_lack(plant, own_robot=robot is None):
+            controller = _build_controller(resolved, replace(knowledge, train=source), true_model)
     except BaseException:
         plant.close()
         raise
     return plant, controller, () if source is None else source.given
+
+
+@contextlib.contextmanager
+def naming_the_lack(plant: Plant, *, own_robot: bool) -> Iterator[None]:
+    """Add to an error of a controller that calls the nominal model where there is none that this is so."""
+    try:
+        yield
+    except (AttributeError, ConfigurationError, TypeError) as error:
+        if own_robot and plant.nominal_jacobian() is None and re.search("NoneType|callable", str(error)):
+            lack = "knowledge.nominal_jacobian is None here: this plant has no model"
+            if isinstance(error, ConfigurationError):
+                raise ConfigurationError(f"{error}; {lack}") from error
+            error.add_note(lack)
+        raise
 
 
 def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:

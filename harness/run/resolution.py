@@ -13,7 +13,7 @@ from servobench.harness.run.scenario import Task
 from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
-from servobench.plant.contract.settings import listed, override, suggest
+from servobench.plant.contract.settings import listed, override, remark, suggest
 from servobench.plant.robot.mismatch import PROFILE_SETTINGS
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.twin import Twin
@@ -110,8 +110,26 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     defaults: dict[str, Any] = {"run": RunSettings()}
     defaults |= {name: _plant_default(find(name), robot, period) for name in plants}
     defaults |= {name: default_config(registry.find_controller(name), model_known=robot.known) for name in controllers}
+    if all(find(name).no_model for name in plants):
+        _probe(defaults, list(plants), [name for name in controllers if _may_probe(name, settings)])
     defaults |= {name: fitted(name, robot) for name in tasks}
     return Sections({name: settings.resolve(name, default) for name, default in defaults.items()}, settings, defaults)
+
+
+def _may_probe(controller: str, settings: Settings) -> bool:
+    """Return whether a controller finds its first Jacobian itself, and the user has not said how."""
+    entry = registry.find_controller(controller)
+    given = flatten(settings.sections.get(controller, {}))
+    return hasattr(entry.config(), "initial") and not entry.needs_truth and "initial.source" not in given
+
+
+def _probe(defaults: dict[str, Any], plants: list[str], controllers: list[str]) -> None:
+    """Let controllers find their first Jacobian by moves, without the posture aid, which takes a better one."""
+    for name in controllers:
+        defaults[name] = override(name, defaults[name], {"initial": {"source": "probe"}, "aids": {"posture": False}})
+    if controllers:
+        how = f"{listed(controllers)}: initial.source=probe and aids.posture=false"
+        remark(f"{listed(plants)} has no model, so the mismatch is none, and for {how}")
 
 
 def _plant_default(entry: PlantEntry, robot: Robot, period: float) -> Any:  # noqa: ANN401 - any dataclass

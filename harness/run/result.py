@@ -70,6 +70,7 @@ class Ending:
         else:
             status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
             reason = f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
+            reason = "; ".join((reason, *getattr(error, "__notes__", ())))
         return cls(status, f"{reason}{where}", _trace(error) if place else "")
 
 

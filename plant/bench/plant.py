@@ -202,6 +202,8 @@ class PlantEntry:
         build: makes the plant from its settings and the setup.
         own_robot: it brings a robot and a start of its own: taught tasks, `--robot` and mismatches do not apply, and
             no nominal model is known.
+        no_model: it brings a robot of its own of which controllers get no nominal model: they probe the first Jacobian
+            and have no posture aid, unless told otherwise.
         config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
@@ -215,6 +217,7 @@ class PlantEntry:
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
     own_robot: bool = False
+    no_model: bool = False
     side_by_side: bool = False
     needs: tuple[str, ...] = ()
     lacking: Callable[[], str] | None = None

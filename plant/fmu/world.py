@@ -29,7 +29,16 @@ from servobench.plant.fmu.description import NUMERIC, REAL_TYPES, FmuDescription
 from servobench.plant.fmu.instance import Instance, Port
 from servobench.plant.fmu.instances import WHOLE_TYPES, Instances, Lane, open_instance
 from servobench.plant.fmu.library import logger
-from servobench.plant.fmu.mapping import FmuMapping, first_instant, mapping_spec, own_step, read_mapping, unusual_step
+from servobench.plant.fmu.mapping import (
+    FmuMapping,
+    LogNames,
+    TruthMapping,
+    first_instant,
+    mapping_spec,
+    own_step,
+    read_mapping,
+    unusual_step,
+)
 from servobench.plant.fmu.model_exchange import build_model
 from servobench.plant.fmu.release import release
 from servobench.plant.robot.arm import rpy_from_rotation
@@ -38,6 +47,9 @@ from servobench.plant.robot.hand_eye import RobotModel
 REHEARSED_STEPS: Final = 5  # periods of an arm at rest in which outputs of foreign FMUs may jump
 MIN_JUMP: Final = 1e-6  # [unit of the output]
 MAX_JUMP_RATIO: Final = 5.0  # [1] A change is a jump if it is so many times larger than those after it.
+# Names in exported arms.
+ARM_JOINTS: Final = ("joint_velocity_command", "joint_position")
+ARM_FEATURES: Final = ("ball_position", "feature")
 SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
 INTEGERS: Final = {"Integer": "int32", "Enumeration": "int32", **WHOLE_TYPES}
@@ -455,11 +467,39 @@ def fmu_entry(path: Path) -> PlantEntry:
         ValueError: the mapping cannot be used.
     """
     if path.suffix.lower() == ".fmu":
-        raise ValueError(f"plant {path} needs a mapping, a TOML that names file, inputs and features")
-    mapping = read_mapping(FmuMapping, path)
-    summary = f"the FMU {mapping.file.name}, as mapped by {path.name}"
-    return PlantEntry(f"fmu:{path}", summary, FmuConfig, partial(_build, mapping), own_robot=True)
+        mapping = _exported_arm(path)
+        how = "by the names of exported arms"
+    else:
+        mapping = read_mapping(FmuMapping, path)
+        how = f"as mapped by {path.name}"
+    summary = f"the FMU {mapping.file.name}, {how}"
+    no_model = mapping.nominal is None
+    build = partial(_build, mapping)
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True, no_model=no_model)
 
 
 def _build(mapping: FmuMapping, config: FmuConfig, setup: PlantSetup) -> Bench:
     return build_fmu(mapping, setup, config.command_delay, config.sensing)
+
+
+def _exported_arm(path: Path) -> FmuMapping:
+    """Return the mapping of an arm that was exported, by the names that it has.
+
+    Raises:
+        ValueError: an FMU with other names.
+    """
+    description = read_description(path, extract_fmu(path))
+    units = {variable.name.partition("[")[0]: variable.unit for variable in description.variables}
+    features = [name for name in ARM_FEATURES if name in units]
+    if not (features and {*ARM_JOINTS, "jacobian"} <= units.keys()):
+        keys = "its file, inputs and features"
+        raise ValueError(f"{path.name} has not the names of an exported arm: write a mapping, a TOML that names {keys}")
+    return FmuMapping(
+        path,
+        inputs=ARM_JOINTS[:1],
+        joints=ARM_JOINTS[1:],
+        features=tuple(features[:1]),
+        seen=tuple(name for name in ("seen",) if name in units),
+        truth=TruthMapping(jacobian=("jacobian",)),
+        names=LogNames(feature_unit=units[features[0]]),
+    )

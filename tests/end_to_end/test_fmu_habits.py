@@ -2,19 +2,25 @@
 
 import multiprocessing
 import pickle
+import re
 
 import numpy as np
 import pytest
 
 from kit.command import servobench
 from kit.stub_fmu import PROBES, TARGET, build_stub, describe
+from servobench import Controller, compare
+from servobench.fmus.export import ExportOptions, export_fmu, nominal_setup
+from servobench.fmus.inspection import validate_fmu
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import Block, Job, _carry_out_there, unpack_result
-from servobench.harness.batch.plan import Cell
+from servobench.harness.batch.plan import Batch, Cell
+from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolution import resolve
-from servobench.plant.contract.faults import FmuError
+from servobench.harness.run.resolution import resolve, resolve_sections
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.faults import ConfigurationError, FmuError
 from servobench.plant.contract.settings import remark
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
@@ -32,9 +38,10 @@ def fresh(tmp_path, monkeypatch):
     remark.cache_clear()
 
 
-def run(monkeypatch, mapping, *options: str, out: str = "out") -> int:
-    place = str(mapping.with_name(out))
+def run(monkeypatch, mapping, *options: str, duration: int = 1) -> int:
+    place = str(mapping.with_name("out"))
     words = ("run", "--plant", f"fmu:{mapping}", "--controller", "ukf_mfac", *TARGET, "--no-figures", "--out", place)
+    words = (*words, "--set", f"target.duration={duration}")
     return servobench(monkeypatch, *words, *options)
 
 
@@ -238,3 +245,102 @@ def test_an_fmu_that_does_not_decode_its_uri_finds_its_resources(opened, tmp_pat
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / folder))
     world = opened('OPENS="gain.txt"', files=("gain.txt",))
     np.testing.assert_allclose(world.see(), TIP, atol=1e-15)
+
+
+def test_a_plant_without_a_model_settles_without_further_settings_and_says_so(monkeypatch, tmp_path, caplog):
+    mapping = build_stub(tmp_path)
+    assert run(monkeypatch, mapping, duration=6) == 0
+    (row,) = results.load_runs(tmp_path / "out").to_dict("records")
+    assert (row["outcome"], row["mismatch"]) == ("settled", "none")
+    note = "has no model, so the mismatch is none, and for ukf_mfac: initial.source=probe and aids.posture=false"
+    assert caplog.text.count(note) == 1
+
+
+def test_settings_of_a_user_and_plants_with_a_model_stay_as_they_are(tmp_path, caplog):
+    plant = f"fmu:{build_stub(tmp_path)}"
+    given = {"ukf_mfac": {"initial": {"source": "probe"}}}
+    controller = resolve(RunRequest(plant, "ukf_mfac", "target", Mismatch(), 0), Settings(given)).controller
+    assert controller.aids.posture
+    mixed = [RunRequest(each, "ukf_mfac", "target", Mismatch(), 0) for each in (plant, "kinematic")]
+    assert resolve_sections(mixed, Settings({}))["ukf_mfac"].initial.source == "nominal"
+    assert "has no model" not in caplog.text
+    batch = Batch((plant, "kinematic"), ("ukf_mfac",), ("target",), ("moderate",), (0,))
+    assert [str(request.mismatch) for request in batch.requests()] == ["none", "moderate"]
+
+
+class Calls(Controller):
+    """Calls the nominal model, which is not there."""
+
+    def __init__(self, knowledge):
+        self.knowledge = knowledge
+
+    def reset(self, observation, seed):
+        self.knowledge.nominal_jacobian(observation.joint_position)
+
+    def step(self, observation, reference):
+        raise NotImplementedError
+
+
+class Builds(Calls):
+    """Calls it at once."""
+
+    def __init__(self, knowledge):
+        super().__init__(knowledge)
+        self.first = knowledge.nominal_jacobian(np.zeros(2)) @ np.zeros(2)
+
+
+def test_a_controller_that_calls_the_model_of_a_plant_without_one_is_told(tmp_path):
+    settings = {"target": {"target": [0.1, 0.75], "duration": 0.2}}
+    plants = [f"fmu:{build_stub(tmp_path)}"]
+    lack = "knowledge.nominal_jacobian is None here: this plant has no model"
+    (reason,) = compare([Calls], plants, ["target"], settings=settings)["reason"]
+    assert reason.startswith(f"TypeError: 'NoneType' object is not callable; {lack}")
+    with pytest.raises(ConfigurationError, match=f"'NoneType' object is not callable; {lack}"):
+        compare([Builds], plants, ["target"], settings=settings)
+
+
+def test_an_exported_arm_needs_no_mapping(tmp_path):
+    path = tmp_path / "arm.fmu"
+    export_fmu(path, ExportOptions(2, nominal_setup()))
+    entry = find_plant(f"fmu:{path}")
+    assert entry.no_model
+    plant = entry.build(entry.config(), PlantSetup(None, None, 0.05))
+    assert (plant.spec.n, plant.spec.m, plant.spec.feature_unit) == (6, 3, "m")
+    assert plant.truth().jacobian.shape == (3, 6)
+    plant.close()
+    build_stub(tmp_path)
+    with pytest.raises(ValueError, match="stub.fmu has not the names of an exported arm: write a mapping, a TOML"):
+        find_plant(f"fmu:{tmp_path / 'stub.fmu'}")
+
+
+@pytest.mark.parametrize(
+    ("more", "problem"),
+    [
+        ('<DefaultExperiment startTime="1e300"/>', r"startTime .* must be within 1e\+12 s, got 1e\+300"),
+        ('<DefaultExperiment stopTime="-1"/>', "stopTime .* must be later than startTime, 0, got -1"),
+        ('<DefaultExperiment startTime="5" stopTime="5"/>', "stopTime .* must be later than startTime, 5, got 5"),
+        ('<DefaultExperiment stepSize="0"/>', "stepSize of the default experiment must be above 0, got 0"),
+        ('<DefaultExperiment stepSize="fast"/>', "stepSize of the default experiment must be above 0, got nan"),
+        ('<DefaultExperiment tolerance="-1"/>', "tolerance of the default experiment must be above 0, got -1"),
+        ('<ModelExchange modelIdentifier="../stub"/>', "modelIdentifier of model exchange must .* got '../stub'"),
+        ('<ScheduledExecution modelIdentifier="a/b"/>', "modelIdentifier of scheduled execution must .* got 'a/b'"),
+        ('<DefaultExperiment startTime="-5" stopTime="-1" stepSize="1e-3" tolerance="1e-6"/>', None),
+        ("", None),
+    ],
+)
+def test_validate_judges_the_default_experiment_and_every_identifier(tmp_path, more, problem):
+    build_stub(tmp_path, description=describe(more))
+    problems = validate_fmu(tmp_path / "stub.fmu").problems
+    assert problems == () if problem is None else re.search(problem, problems[0])
+
+
+def test_what_breaks_the_standard_and_runs_is_no_problem(output_of, tmp_path):
+    text = describe().replace("<Outputs>", "<!--").replace("</Outputs>", "-->")
+    build_stub(tmp_path, description=text, files=("\x1b[2Jx",))
+    printed = output_of("fmu", "validate", tmp_path / "stub.fmu", code=1)
+    assert "problem: the name of a file must have printable letters, got 'resources/\\x1b[2Jx'" in printed
+    assert "breaks the standard here: ModelStructure" in printed
+    build_stub(tmp_path, description=text)
+    printed = output_of("fmu", "validate", tmp_path / "stub.fmu")
+    assert "breaks the standard here, runs nevertheless: ModelStructure" in printed
+    assert "problem" not in printed

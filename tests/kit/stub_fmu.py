@@ -11,7 +11,7 @@ from kit.foreign_fmu import SOURCES
 from servobench.fmus.compiler import this_platform
 
 MAPPING = 'file = "stub.fmu"\ninputs = ["u"]\njoints = ["q"]\nfeatures = ["y"]\n'
-TARGET = ("--task", "target", "--set", "target.target=[0.1,0.75]", "--set", "target.duration=1")
+TARGET = ("--task", "target", "--set", "target.target=[0.1,0.75]")
 PROBES = ("--mismatch", "none", "--set", "ukf_mfac.initial.source=probe", "--set", "ukf_mfac.aids.posture=false")
 START = ' start="0"'
 CAUSES = {"q": "output", "u": "input", "y": "output"}
