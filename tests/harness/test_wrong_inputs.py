@@ -58,7 +58,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("run", "--plant", "fmu:"), "mapping . cannot be read"),
     (("run", "--plant", "fmu:none.toml"), "none.toml"),
     (("run", "--plant", "none.toml"), "mapping none.toml cannot be read: No such file"),
-    (("run", "--plant", "no.fmu"), "fmu file no.fmu does not exist"),
+    (("run", "--plant", "no.fmu"), "fmu file no.fmu is not a zip archive"),
     (("run", "--plant", "fmu:no_fmu.toml"), "no_fmu.toml"),
     (("run", "--controller", "ukf_mfca"), "unknown controller 'ukf_mfca': did you mean 'ukf_mfac'?"),
     (("run", "--controller", "mfac"), "unknown controller 'mfac': it is a law and makes a pair, such as mfac+ukf"),
