@@ -202,14 +202,14 @@ class PlantEntry:
         build: makes the plant from its settings and the setup.
         own_robot: it brings a robot and a start of its own: taught tasks, `--robot` and mismatches do not apply, and
             no nominal model is known.
-        no_model: it brings a robot of its own of which controllers get no nominal model: they probe the first Jacobian
-            and have no posture aid, unless told otherwise.
         config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
         lacking: returns one line about missing parts of this machine other than packages; empty if nothing is missing.
         engine: returns one line about the software that computes or renders it, for the terminal and the manifest.
         any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
+        no_model: it brings a robot of its own of which controllers get no nominal model: they probe the first Jacobian
+            and have no posture aid, unless told otherwise.
     """
 
     name: str
@@ -217,13 +217,13 @@ class PlantEntry:
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
     own_robot: bool = False
-    no_model: bool = False
     side_by_side: bool = False
     needs: tuple[str, ...] = ()
     lacking: Callable[[], str] | None = None
     engine: Callable[[], str] | None = None
     config_for: Callable[[Robot], Any] | None = None
     any_sensing: bool = False
+    no_model: bool = False
 
 
 class World(Abilities):
