@@ -340,6 +340,16 @@ def check_steps(folder: Path) -> None:
         raise ConfigurationError(f"{folder} holds no steps: a sweep keeps none; use run or compare")
 
 
+def check_runs(folder: Path, runs: pd.DataFrame) -> None:
+    """Refuse a folder whose table of runs is empty.
+
+    Raises:
+        ConfigurationError: it is.
+    """
+    if runs.empty:
+        raise ConfigurationError(f"{folder} holds no finished run")
+
+
 def check_folder(folder: Path) -> dict[str, Any]:
     """Return the manifest of a folder with results of this schema.
 

@@ -42,6 +42,17 @@ LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
 START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
+
+
+class WorkersNotStarted(ConfigurationError, SystemExit):
+    """No worker process can be started; where nothing catches it, a script ends with its line alone."""
+
+    def __init__(self, message: str) -> None:
+        """Keep the message, which Python prints."""
+        super().__init__(message)
+        self.code = str(self)
+
+
 START_ERROR: Final = 1  # exit code of a guard that an error has kept from starting
 STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
 TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
@@ -259,7 +270,7 @@ class Sandbox:
             self.end(0.0)
             if again and ended not in (None, START_ERROR):
                 return self._start(again=False)
-            raise ConfigurationError(fault)
+            raise WorkersNotStarted(fault)
         self._link = ours
         return ours
 

@@ -228,6 +228,7 @@ OWN_STEMS: Final = frozenset(  # names of files and folders that a results folde
     ("runs", "steps", "manifest", "failures", "sha256sums", "parts", "pictures", "networks", "figures", "recordings",
      "report", "latest")
 )  # fmt: skip
+MAX_NUMBER: Final = 1e150  # whose square is finite
 RUN_ID: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9.=+_-]*")  # also the name of a file: no separator, no ".."
 
 
@@ -302,7 +303,8 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
         raise ConfigurationError(f"{path} is no table of runs: it lacks the column settling_time_s")
     least, most = runs.min(numeric_only=True).to_dict(), runs.max(numeric_only=True).to_dict()
     for name in [each for each in MOST if each in least]:
-        if least[name] < 0.0 or most[name] > MOST[name]:
+        is_huge = runs[name].between(MAX_NUMBER, math.inf, inclusive="neither").any()
+        if least[name] < 0.0 or most[name] > MOST[name] or is_huge:
             raise ConfigurationError(f"{path} is no table of runs: {name} is {min(least[name], 0.0) or most[name]:g}")
     taken: dict[str, int] = {}
     for row, run_id in enumerate(runs["run_id"]):

@@ -173,9 +173,21 @@ def _usage_line(error: typer.TyperException) -> str:
     option = getattr(error, "option_name", None)
     if context and (reason := ABSENT.get((context.info_name, option))):
         return f"{context.info_name} has no {option}: {reason}"
+    if context and option and (key := short_key(option)):
+        return f"{context.info_name} has no {option}: it is a setting, --set {key}=...; sweep varies it by {option}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
     return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""
+
+
+def short_key(option: str) -> str:
+    """Return the setting for which an option of sweep is short, for the default plant; empty for other options."""
+    from servobench.harness.run.request import SHORT_NAMES
+
+    short = SHORT_NAMES.get(option.removeprefix("--"))
+    if short is None:
+        return ""
+    return short.key.replace("plant.", "kinematic.")
 
 
 def _line_of_system(error: OSError) -> str | None:

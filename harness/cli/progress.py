@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from rich import progress
@@ -18,7 +18,16 @@ from servobench.harness.batch.campaign import Execution, Observer, Row
 from servobench.harness.cli.terminal import end_interrupted
 from servobench.plant.contract.files import harmless
 
+MANY_RUNS: Final = 10_000  # from which on their number and time are told first
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
+
+
+def show_time(seconds: float) -> str:
+    """Return a time [s] in words, in the largest unit of which there are two or more."""
+    for unit, size in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 class Lines:
@@ -39,7 +48,9 @@ class Lines:
         if now < self._due:
             return
         so_far = now - self._began
-        left = f", about {so_far * (1.0 - share) / share:.0f} s left" if 0.0 < share < 1.0 else ""
+        left = ""
+        if 0.0 < share < 1.0:
+            left = f", about {show_time(so_far * (1.0 - share) / share)} left"
         sys.stderr.write(f"{text}{left}\n")
         sys.stderr.flush()
         self._due = now + max(FIRST_LINE, LINE_SHARE * so_far)
@@ -120,6 +131,7 @@ class ConsoleObserver(Observer):
         self._tell = self._shown.enter_context(telling(console, "checking the configuration"))
         self.done = self.total = 0
         self.count = np.zeros(2, dtype=np.intp)
+        self._is_told = False
 
     def training(self, share: float, subject: str) -> None:
         """Show how much of a training of networks is done."""
@@ -130,6 +142,10 @@ class ConsoleObserver(Observer):
         self.close()
         self.done, self.total = done, total
         self.count += (done, total)
+        self._began = time.monotonic()
+        self._first = done
+        if total - done >= MANY_RUNS:
+            self.note(f"{total - done:,} runs begin; Ctrl-C ends them, and --resume goes on")
         self._bars = self._shown.enter_context(Bars(self._console, RateColumn(), shown=self._shows_bar))
         self._bar = self._bars.begin("running", total, done)
         if done == total:
@@ -139,9 +155,20 @@ class ConsoleObserver(Observer):
         """Advance the bar."""
         self.done += len(rows)
         self.count[0] += len(rows)
+        self._expect()
         self._bars.reach(self._bar, self.done, f"{self.done} of {self.total} runs")
         if self.done == self.total:
             self.close()
+
+    def _expect(self) -> None:
+        """Print once how long many runs will take, after a few seconds of them."""
+        so_far = time.monotonic() - self._began
+        finished = self.done - self._first
+        missing = self.total - self.done
+        if missing < MANY_RUNS or not finished or so_far < FIRST_LINE or self._is_told:
+            return
+        self._is_told = True
+        self.note(f"{missing:,} runs are left, about {show_time(so_far / finished * missing)}")
 
     def note(self, text: str) -> None:
         """Print a line."""

@@ -110,7 +110,9 @@ def figures(
 
     formats = selection.split_names("format", format_, ALL_FORMATS)
     kinds = selection.split_names("kind", kind, tuple(KINDS))
-    known = list(dict.fromkeys(results.load_runs(folder)["controller"]))
+    runs = results.load_runs(folder)
+    results.check_runs(folder, runs)
+    known = list(dict.fromkeys(runs["controller"]))
     shown = selection.split_names("controllers", controllers, known)
     own = [name.strip() for name in names.split(",")] if names else shown
     if len(own) != len(shown):

@@ -69,7 +69,6 @@ def run(
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.plan import Batch, check_seeds
     from servobench.harness.config.registry import default_plant
-    from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
@@ -83,7 +82,7 @@ def run(
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.choose("controllers", law if estimator is None else f"{law}+{estimator}")
     seeds = check_seeds((seed,), f"got {seed}")
-    batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
+    batch = Batch((plant,), (name,), (selection.choose("tasks", task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     _carry_out(campaign, out, how, with_figures=with_figures, with_report=with_report, strict=True)

@@ -127,6 +127,8 @@ def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
 def choose(kind: str, word: str) -> str:
     """Return the name of a kind that a user named, or whose place was given; a wrong one is refused."""
     names = names_of(kind)
+    if len(split_words(word, names.known())) > 1:
+        raise ConfigurationError(f"{word!r} names several, where one is wanted; compare takes several")
     name = _chosen(names.find, word)
     _tell_unused(names, [name])
     return name

@@ -103,12 +103,17 @@ def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFr
     drawings = {name: drawing_of(figure)._asdict() for name, figure in figures.items()}
     text = Template((Path(__file__).parent / TEMPLATE).read_text(encoding="utf-8")).substitute(
         {f"{name}_{key}": value for name, drawing in drawings.items() for key, value in drawing.items()},
-        table=table.rename(columns=lambda name: name.replace("\n", " ")).to_html(index=False, border=0),
+        table=table.rename(columns=one_line).to_html(index=False, border=0),
         legend=escape(legend),
     )
     page = folder / PAGE
     write_atomically(page, lambda path: path.write_text(text, encoding="utf-8"))
     return [page, *paths]
+
+
+def one_line(heading: str) -> str:
+    """Return a heading without the breaks that a terminal needs, also within a word."""
+    return heading.replace("-\n", "").replace("\n", " ")
 
 
 def _falling_phase(curve: FloatArray) -> FloatArray:

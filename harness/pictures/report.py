@@ -31,7 +31,6 @@ from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.harness.run.request import DEFAULT_ROBOT, varied_columns
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import ConfigurationError
 from servobench.plant.contract.files import accessing, write_atomically
 
 NAME: Final = "report.html"
@@ -79,8 +78,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         ConfigurationError: not a results folder, no run in it, or the page cannot be written.
     """
     runs = titled_runs(folder)
-    if runs.empty:
-        raise ConfigurationError(f"{folder} holds no finished run")
+    results.check_runs(folder, runs)
     target = path or folder / NAME
     with accessing(target, "report"):
         write_atomically(target, lambda file: file.write_text(_page(folder, runs), encoding="utf-8"))

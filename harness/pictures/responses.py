@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import offset_copy
 
 from servobench.harness.analysis.comparison import handy_unit
 from servobench.harness.pictures.style import (
@@ -61,10 +62,10 @@ QUANTITIES: Final = (
     ("acceleration [rad/s²]", "joint_acceleration_rms_rad_s2", "RMS {:.3g}"),
     ("jerk [rad/s³]", "joint_jerk_rms_rad_s3", "RMS {:.3g}"),
 )  # a column of panels each: its title, the metric written into it, and its form
-STACKED: Final = 1.5  # ratio of the heights of marks that stand above each other
+MARK_SIZE: Final = 6.5  # [points] width of the mark at a settling time
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
 AXIS_ROOM: Final = 1.3  # of an axis over the largest error after the approach
-NEAR: Final = 0.02  # of a time axis, within which marks stand above each other
+NEAR: Final = 0.02  # of a time axis, within which marks stand side by side
 FLOOR: Final = 0.1  # settling bands: the least error that is shown over time
 OUTSIDE: Final = 1e12  # of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
@@ -268,18 +269,24 @@ def mark_settling_band(axes: Axes, runs: Shown) -> None:
 
 
 def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
-    """Mark on the settling band the median settling time of each controller; equal ones stand above each other."""
-    placed: list[float] = []
-    span = shown_until(ensembles)
-    for name, ensemble in ensembles.items():
-        if math.isfinite(ensemble.settling_time) and math.isfinite(ensemble.settling_band):
-            style, time = styles[name], ensemble.settling_time
-            level = ensemble.settling_band * STACKED ** sum(abs(time - other) < NEAR * span for other in placed)
-            placed.append(time)
-            edge = style.colour if style.hollow else "black"
-            axes.plot(time, level, marker="v", markersize=6.5, linestyle="",
-                      color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
-                      markerfacecolor=style.face, zorder=11, gid=SETTLED)  # fmt: skip
+    """Mark below the settling band the median settling time of each controller; equal ones stand side by side."""
+    near = NEAR * shown_until(ensembles)
+    anchor = -math.inf
+    beside = 0  # marks that stand from the anchor on
+    settled = [each for each in ensembles.items() if math.isfinite(each[1].settling_time + each[1].settling_band)]
+    for name, ensemble in sorted(settled, key=lambda each: each[1].settling_time):
+        if ensemble.settling_time >= anchor + beside * near:
+            anchor = ensemble.settling_time
+            beside = 0
+        style = styles[name]
+        edge = style.colour if style.hollow else "black"
+        place = offset_copy(
+            axes.transData, axes.get_figure(root=True), MARK_SIZE * beside, -0.6 * MARK_SIZE, units="points"
+        )
+        axes.plot(anchor, ensemble.settling_band, marker="^", markersize=MARK_SIZE, linestyle="", transform=place,
+                  color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
+                  markerfacecolor=style.face, zorder=11, gid=SETTLED)  # fmt: skip
+        beside += 1
 
 
 def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:

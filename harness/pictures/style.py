@@ -265,7 +265,7 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    for gid, marker in ((SETTLED, "v"), (ENDED, END)):
+    for gid, marker in ((SETTLED, "^"), (ENDED, END)):
         if any(line.get_gid() == gid for axes in panels for line in axes.get_lines()):
             entries[gid] = mpl.lines.Line2D([], [], color="0.3", marker=marker, markersize=7, linestyle="")
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))

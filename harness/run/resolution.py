@@ -214,7 +214,12 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
     known = {*registry.plant_names(), *registry.controller_names(), *task_names(), *pairs, *names}
     for section in settings.sections:
         if section not in known:
-            raise ConfigurationError(f"unknown section {section!r}: {suggest(section, known)}")
+            hint = suggest(section, known)
+            for name in names:
+                default = _default(name)
+                if hasattr(default, section):
+                    hint = f"it is a setting of {name}: write {name}.{section}"
+            raise ConfigurationError(f"unknown section {section!r}: {hint}")
     for section, _, text in settings.assigned:
         if section not in names:
             found = f"--set {text}: {section!r} does not run here, so this has no effect"

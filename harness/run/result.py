@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from servobench.harness.config.source import PACKAGE_FOLDER, is_users
 from servobench.plant.contract.faults import ConfigurationError, RunFault
+from servobench.plant.contract.files import harmless
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,8 +112,9 @@ def log_entry(row: Mapping[str, Any], trace: str) -> str:
     """
     if row.get("status", COMPLETED) == COMPLETED:
         return ""
-    lines = "".join(f"    {line}\n" for line in trace.splitlines())
-    return f"{row['run_id']}: {row['status']}: {row.get('reason', '')}\n{lines}\n"
+    head = f"{row['run_id']}: {row['status']}: {row.get('reason', '')}"
+    lines = [harmless(head), *(f"    {harmless(line)}" for line in trace.splitlines()), "", ""]
+    return "\n".join(lines)
 
 
 class _Place(NamedTuple):

@@ -17,7 +17,9 @@ A plant or controller of a third party derives its own from `RunFault`.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import ClassVar, Final
+
+MAX_LENGTH: Final = 4000  # characters of a message; a longer one repeats something that a file holds
 
 
 class RunFault(RuntimeError):
@@ -65,6 +67,9 @@ class ConfigurationError(ValueError):
     def __init__(self, message: str) -> None:
         """Keep the message without line ends and without characters that would control a terminal."""
         words = " ".join(message.split())
+        if len(words) > MAX_LENGTH:
+            half = MAX_LENGTH // 2
+            words = f"{words[:half]} ... {words[-half:]}"
         super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))
 
 

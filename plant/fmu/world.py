@@ -114,9 +114,9 @@ class FmuWorld(World):
         self._mapping, self.lag = mapping, lag
         self.description = description = read_sized(mapping.file, mapping.parameters)
         if description.needs_tool:
-            logger.warning("%s calls the tool that made it, which has to be installed here", mapping.file.name)
-        if model is None and (remark := unusual_step(mapping, description, period)):
-            logger.warning(remark)
+            remark(f"{mapping.file.name} calls the tool that made it, which has to be installed here")
+        if model is None and (unusual := unusual_step(mapping, description, period)):
+            logger.warning(unusual)
         self.spec = mapping_spec(mapping, description, period)
         self._begin = first_instant(mapping.start_time, description, self._own_step)
         if model is not None:

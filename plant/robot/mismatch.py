@@ -62,7 +62,10 @@ def _unknown_word(text: str, word: str) -> ValueError:
         if "=" in word and name != "factory":
             remedy = f"the profile {name} has no magnitude"
         return ValueError(f"mismatch {text!r}: {word!r} is not known here; {remedy}")
-    near = nearest(name, [*PROFILES, *AXES])
+    known = list(PROFILES)
+    if "=" in word:
+        known += AXES
+    near = nearest(name, known)
     hint = f"did you mean {near!r}? " if near else ""
     examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
     wanted = f"one profile ({', '.join(PROFILES)}, factory=FILE) and then axes such as {examples}, joined by '+'"

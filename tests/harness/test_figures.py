@@ -244,3 +244,17 @@ def test_a_figure_for_which_there_is_no_room_is_named_and_the_old_one_stays(endi
         save_figure(figure, tmp_path / "a", [ending])
     assert caught.value.filename == str(path)
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [(path.name, "old")]
+
+
+def test_settling_times_of_equal_methods_stand_side_by_side_below_the_band(tmp_path):
+    times = {"rls": 1.02, "ukf_mfac": 1.0, "broyden": 1.01, "constant": 1.5, "rbf_pid": math.nan}
+    ensembles = {}
+    for name, time in times.items():
+        ensembles |= seeds_of(tmp_path / name, [1.0], name, settling_time_s=time)
+    axes = draw_moves({"exp1": ensembles}, method_styles(list(times))).axes[0]
+    marks = [line for line in axes.get_lines() if line.get_gid() == SETTLED]
+    places = [mark.get_transform().transform(mark.get_xydata())[0] for mark in marks]
+    assert np.diff(places, axis=0)[:2] == pytest.approx(np.array([[6.5, 0.0]] * 2) * axes.figure.dpi / 72)
+    band = axes.transData.transform([(1.5, 5.0)])[0]
+    assert places[3][0] == pytest.approx(band[0])
+    assert all(y < band[1] for _, y in places)

@@ -28,6 +28,7 @@ from servobench.harness.analysis.loops.systems import (
     phase_crossings,
 )
 from servobench.harness.config.settings import Settings
+from servobench.harness.pictures.loops import one_line
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.sensing import SensingConfig
@@ -210,3 +211,11 @@ def test_only_a_composed_controller_has_a_fast_delay_margin():
 
 def test_a_loop_without_states_is_stable():
     assert is_stable(np.zeros((0, 0)))
+
+
+def test_a_heading_on_the_page_has_no_breaks_of_the_terminal():
+    assert [one_line(each) for each in ("over-\nshoot, %", "settling\ntime, s", "M_s")] == [
+        "overshoot, %",
+        "settling time, s",
+        "M_s",
+    ]

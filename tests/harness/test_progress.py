@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from servobench.harness.cli import progress
-from servobench.harness.cli.progress import FIRST_LINE, ConsoleObserver, Lines, telling
+from servobench.harness.cli.progress import FIRST_LINE, ConsoleObserver, Lines, show_time, telling
 
 
 @pytest.fixture
@@ -55,3 +55,25 @@ def test_a_note_is_neither_markup_nor_words_for_the_terminal():
     console = piped()
     ConsoleObserver(console).note("left by [/red] of a\x1b[2J")
     assert console.file.getvalue() == "left by [/red] of a\\u001b[2J\n"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(40.0, "40 s"), (119.0, "119 s"), (600.0, "10 minutes"), (9000.0, "2 hours"), (699377.0, "8 days")],
+)
+def test_a_time_is_told_in_its_largest_unit(seconds, words):
+    assert show_time(seconds) == words
+
+
+def test_many_runs_are_counted_before_they_begin_and_their_time_is_told_once(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    console = piped()
+    observer = ConsoleObserver(console)
+    observer.begin(900_000, 0)
+    assert console.file.getvalue() == "900,000 runs begin; Ctrl-C ends them, and --resume goes on\n"
+    for _ in range(20):
+        now[0] += 1.0
+        observer.finished([{}])
+    assert console.file.getvalue().splitlines()[1:] == ["899,995 runs are left, about 10 days"]
+    observer.close()

@@ -258,3 +258,9 @@ def test_a_type_error_behind_the_call_is_told_as_it_is():
     assert servobench.run(kind, task="exp2", settings=SHORT).row["reason"] == (
         "TypeError: object of type 'int' has no len() (wrong.py:4 in Inner.step)"
     )
+
+
+def test_the_log_of_failures_holds_nothing_that_a_terminal_obeys():
+    row = made_up_row("run0", status="crashed", reason="no \x1b[2J\u202e")
+    entry = log_entry(row, "File x\n    \x1b]0;title\x07")
+    assert entry == "run0: crashed: no \\u001b[2J\\u202e\n    File x\n        \\u001b]0;title\\u0007\n\n"

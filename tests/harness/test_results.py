@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -425,3 +426,19 @@ def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, unfini
     told = capsys.readouterr()
     assert json.loads(told.out)
     assert told.err == f"{MISSING}\n"
+
+
+@pytest.mark.parametrize("value", [1e308, 1e160])
+def test_a_number_whose_square_no_number_can_be_is_refused(tmp_path, value):
+    rows = [made_up_row("a", settling_time_s=1.0), made_up_row("b", settling_time_s=value)]
+    folder = write_folder(tmp_path / "out", rows, [made_up_steps("a"), made_up_steps("b")])
+    with pytest.raises(ConfigurationError, match=re.escape(f"no table of runs: settling_time_s is {value:g}")):
+        results.load_runs(folder)
+
+
+def test_an_empty_table_of_runs_is_named_for_pages_figures_and_notebooks(tmp_path):
+    runs = pd.DataFrame({"run_id": []})
+    with pytest.raises(ConfigurationError, match="^out holds no finished run$"):
+        results.check_runs(Path("out"), runs)
+    notebook = (Path(__file__).parents[2] / "notebooks" / "analysis.ipynb").read_text(encoding="utf-8")
+    assert "results.check_runs(RESULTS, runs)" in notebook
