@@ -24,6 +24,7 @@ from servobench.plant.contract.files import harmless
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE,
         errno.ENAMETOOLONG)  # fmt: skip
+NO_THREAD: Final = "can't start new thread"  # message of Python
 HELP_NAMES: Final = ["-h", "--help"]
 PLURALS: Final = (("s", ""), ("", "s"), ("es", ""), ("", "es"), ("axes", "axis"), ("axis", "axes"))  # and the reverse
 COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
@@ -143,7 +144,7 @@ def _carry_out(caught: list[int]) -> None:
         if line is None:
             raise
         _end(line)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         line = _line_of_system(error)
         if line is None or "--debug" in sys.argv:
             raise
@@ -190,10 +191,14 @@ def short_key(option: str) -> str:
     return short.key.replace("plant.", "kinematic.")
 
 
-def _line_of_system(error: OSError) -> str | None:
-    """Return the one-line error for a folder in which no file can be written; None for a defect."""
+def _line_of_system(error: OSError | RuntimeError) -> str | None:
+    """Return the one-line error for a folder in which no file can be written, or no thread; None for a defect."""
     from servobench.harness.batch.tables import UnwritableFolder
 
+    if isinstance(error, RuntimeError):
+        if str(error) != NO_THREAD:
+            return None
+        return "no more threads or processes may be started here: ulimit -u"
     if isinstance(error, UnwritableFolder):
         return str(error.strerror)
     if error.errno == errno.ENOENT and "temporary directory" in str(error):  # of tempfile

@@ -1,8 +1,10 @@
 """The exit codes of the table in docs/results.md, and what is printed with them."""
 
 import errno
+import re
 import signal
 import tempfile
+import threading
 from functools import partial
 
 import pytest
@@ -138,3 +140,21 @@ def test_a_backend_for_windows_and_a_wrong_epoch_leave_no_traceback(refusal_of, 
     drawn = python("-m", "servobench", *words, path=tmp_path, MPLBACKEND="nonsense", SOURCE_DATE_EPOCH="")
     assert (drawn.returncode, drawn.stderr) == (0, "")
     assert "6 figures in" in drawn.stdout
+
+
+def test_threads_that_the_system_refuses_are_one_line(monkeypatch, capsys):
+    def refuse(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    assert servobench(monkeypatch, "compare", "--controllers", "constant", "--out", "none") == 1
+    assert capsys.readouterr().err.startswith("servobench: no more threads or processes may be started here")
+
+
+def test_a_script_without_a_guard_ends_with_the_line_alone(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("import servobench\nservobench.compare(['constant'], seeds=2, workers=2)\n")
+    ended = python(script)
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    assert re.fullmatch("the worker processes cannot be started; a script .*__main__':`\n", ended.stderr)
