@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from rich import progress
 from rich.console import Console
 from rich.text import Text
@@ -123,14 +122,15 @@ class ConsoleObserver(Observer):
     Attributes:
         done: finished runs.
         total: all runs.
-        count: finished runs of all batches so far, and the number of all of their runs.
+        finished_in_all: finished runs of all batches so far.
+        wanted_in_all: number of all runs of these batches.
     """
 
     def __init__(self, console: Console, *, bar: bool = True) -> None:
         self._console, self._shows_bar, self._shown = console, bar, contextlib.ExitStack()
         self._tell = self._shown.enter_context(telling(console, "checking the configuration"))
         self.done = self.total = 0
-        self.count = np.zeros(2, dtype=np.intp)
+        self.finished_in_all = self.wanted_in_all = 0
         self._is_told = False
 
     def training(self, share: float, subject: str) -> None:
@@ -141,7 +141,8 @@ class ConsoleObserver(Observer):
         """Show the bar."""
         self.close()
         self.done, self.total = done, total
-        self.count += (done, total)
+        self.finished_in_all += done
+        self.wanted_in_all += total
         self._began = time.monotonic()
         self._first = done
         if total - done >= MANY_RUNS:
@@ -154,7 +155,7 @@ class ConsoleObserver(Observer):
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
         self.done += len(rows)
-        self.count[0] += len(rows)
+        self.finished_in_all += len(rows)
         self._expect()
         self._bars.reach(self._bar, self.done, f"{self.done} of {self.total} runs")
         if self.done == self.total:
@@ -191,9 +192,8 @@ def watching(console: Console, folder: Path, how: Execution) -> Iterator[Executi
     observer = ConsoleObserver(console, bar=not how.debug)
     try:
         yield replace(how, observer=observer)
-        finished, wanted = observer.count
-        if wanted > 1:
-            observer.note(f"{finished} of {wanted} runs are there")
+        if observer.wanted_in_all > 1:
+            observer.note(f"{observer.finished_in_all} of {observer.wanted_in_all} runs are there")
     except KeyboardInterrupt:
         observer.close()
         if not any(folder.rglob("*.parquet")):
