@@ -7,17 +7,18 @@ has a row that fits it, and is not noticed.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
 from servobench.harness.run.log import Steps
-from servobench.harness.run.metrics import FINAL_SPAN, METRICS, Judged
+from servobench.harness.run.metrics import FINAL_SPAN, judge_run
 from servobench.harness.run.outcome import FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, OUTCOMES, SETTLED
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.signals import COMMAND, Channel, PlantSpec
+from servobench.plant.contract.signals import COMMAND, PlantSpec
 
 FROM_STEPS: Final = (  # metrics that need neither limits of the plant nor times of the task
     "settling_time_s", "settling_time_5pct_s", "overshoot", "steady_state_error", "rms_error", "max_error", "log_error",
@@ -44,10 +45,9 @@ def find_contradiction(row: Mapping[str, Any], steps: pd.DataFrame | None, perio
     Raises:
         ValueError: the steps lack columns, or have some that no run has.
     """
-    if wrong := _find_within(row, period):
+    wrong = _find_within(row, period)
+    if wrong or steps is None:
         return wrong
-    if steps is None:
-        return ""
     return _find_beside(row, steps, period)
 
 
@@ -95,14 +95,11 @@ def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> 
     if not np.allclose(logged.time, period * np.arange(len(steps)), rtol=TOLERANCE):
         return "its steps are not a period apart"
     with np.errstate(all="ignore"):
-        judged = Judged(logged, row["task_kind"], 0.0, math.nan)
-        if not np.allclose(judged.error, steps["error_norm"], rtol=TOLERANCE, equal_nan=True):
+        computed = judge_run(logged, row["task_kind"], 0.0)
+        if not np.allclose(logged.error_norm(), steps["error_norm"], rtol=TOLERANCE, equal_nan=True):
             return "its error_norm is not that of its steps"
         for name in FROM_STEPS:
-            compute = METRICS[name].values
-            if compute is None:
-                continue
-            found = float(compute(judged))
+            found = float(computed[name])
             told = _number(row, name)
             if not np.isclose(told, found, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
                 return f"its {name} is {told:g}, and by its steps {found:g}"
@@ -112,32 +109,29 @@ def _find_beside(row: Mapping[str, Any], steps: pd.DataFrame, period: float) -> 
 def _as_logged(steps: pd.DataFrame, band: float, period: float) -> Steps:
     """Return a table of steps as the log that it was made of, without Jacobians."""
 
-    def columns(kind: str) -> tuple[str, ...]:
-        return tuple(name for name in steps.columns if name.startswith(f"{kind}_"))
+    def numbers(kind: str) -> FloatArray:
+        return steps[[name for name in steps.columns if name.startswith(f"{kind}_")]].to_numpy(np.float64)
 
-    def numbers(*names: str) -> FloatArray:
-        return steps[list(names)].to_numpy(np.float64)
-
-    places = columns("reference")
-    joints = columns(COMMAND)
-    unlimited = np.full(len(places), np.inf)
-    limit = np.full(len(joints), ANY)
-    feature = Channel(places, "", 1.0, -unlimited, unlimited, band)
-    spec = PlantSpec(feature, Channel(joints, "", 1.0, -limit, limit), -limit, limit, period)
-    true_feature = numbers(*columns("true_feature"))
-    unknown = np.full((len(steps), spec.m, spec.n), np.nan)
+    true_feature = numbers("true_feature")
+    command = numbers(COMMAND)
+    n = command.shape[1]
+    joints = tuple(map(str, range(n)))
+    places = tuple(map(str, range(true_feature.shape[1])))
+    limit = np.full(n, ANY)
+    spec = PlantSpec.of_joints(joints, places, limit, -limit, limit, period)
+    unknown = np.full((len(steps), spec.m, n), np.nan)
     return Steps(
-        spec,
-        time=numbers("time_s")[:, 0],
-        reference=numbers(*places),
+        replace(spec, feature=replace(spec.feature, tolerance=band)),
+        time=steps["time_s"].to_numpy(np.float64),
+        reference=numbers("reference"),
         feature=true_feature,
         true_feature=true_feature,
-        joint_position=numbers(*columns("joint_position")),
-        command=numbers(*joints),
+        joint_position=numbers("joint_position"),
+        command=command,
         feature_valid=steps["feature_valid"].to_numpy(np.bool_),
         estimated_jacobian=unknown,
         true_jacobian=unknown,
-        controller_time=numbers("controller_time_us")[:, 0],
-        plant_time=numbers("plant_time_us")[:, 0],
+        controller_time=steps["controller_time_us"].to_numpy(np.float64),
+        plant_time=steps["plant_time_us"].to_numpy(np.float64),
         diagnostics={},
     )
