@@ -100,7 +100,7 @@ _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
 @contextmanager
 def recording() -> Iterator[None]:
     """Record numpy code of this package within the context: it computes with expressions."""
-    changed: list[tuple[dict[str, Any], str, Any]] = []
+    changed = []
     meanings = {id(old): new for old, new in _MEANINGS}
     with _LOCK:
         try:

@@ -129,7 +129,7 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
     heading = {name: metric_heading(name, runs) for name in METRICS}
     judged = "rms_error_evaluated" if achievement(runs) == FOLLOWED else "steady_state_error"
     factor = shown_unit(judged, runs)[1]
-    rows: list[Row] = []
+    rows = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
@@ -323,7 +323,7 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
         places = [(f"{task}, features in {unit}" if units else str(task), own) for (task, unit), own in pooled]
         interval = False
     single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
-    rows: list[PageRow] = []
+    rows = []
     for name in ordered(runs["controller"]):
         row: PageRow = {(WHICH, "controller"): name}
         for words, place in places:

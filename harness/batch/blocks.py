@@ -208,7 +208,7 @@ def build_block(block: Block, submit: Callable[..., Any], progress: Progress) ->
     Raises:
         ConfigurationError: a setting that cannot be used. If the worker ends instead, the run will say so.
     """
-    refused: list[str] = []
+    refused = []
 
     def hear(told: object) -> None:
         match told:
@@ -282,7 +282,7 @@ def _receive(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool,
 def _carry_out(block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool) -> None:
     """Carry a block out and tell the result of each run."""
     with registry.offering(block.own):
-        together: list[RunResult] = []
+        together = []
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):
@@ -478,7 +478,7 @@ def _workers_of(executor: Executor, count: int) -> Workers:
 
 def _gather(task: Task) -> bytes:
     """Carry a task out elsewhere; its answers travel as one compressed block. Threads of a process take turns."""
-    items: list[object] = []
+    items = []
     with ONE_TASK:
         task.carry_out(lambda item: None if item is None else items.append(item))
     return zlib.compress(json.dumps(items).encode(), 1)

@@ -182,7 +182,7 @@ def descendants(process: int) -> list[int]:
     """Return the ids of all processes below one."""
     if not _lists_children():
         return _ask(process, lambda top: [each.pid for each in top.children(recursive=True)]) or []
-    found: list[int] = []
+    found = []
     waiting = [process]
     while waiting:
         children = _children(waiting.pop())

@@ -76,7 +76,7 @@ def attempt(
     """
     from servobench.harness.batch import processes, sandbox  # noqa: PLC0415 - lists of our own items need neither
 
-    found: dict[str, Any] = {}
+    found = {}
 
     def receive(message: object) -> None:
         match message:

@@ -171,7 +171,7 @@ class Driver:
 @contextlib.contextmanager
 def watching_draws() -> Iterator[list[str]]:
     """Yield a list that gets a sentence on each draw without a seed by code of users within the context."""
-    found: list[str] = []
+    found = []
     source: Any = np.random.bit_generator
     original = source.randbits
 

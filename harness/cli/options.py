@@ -93,7 +93,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as a command that typer can read, with its dataclasses taken apart into options."""
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-    rows: list[tuple[str, Any, Any]] = []
+    rows = []
     camera = [("camera", None, CameraOption)] if (function.__name__, "--camera") not in ABSENT else []
     for name, parameter in signature(function).parameters.items():
         rows += camera if name == "robot" else []

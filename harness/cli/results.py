@@ -124,7 +124,7 @@ def figures(
     say(results.describe_missing(folder))
     choice = Choice(kinds, dict(zip(shown, own, strict=True)), Layout.of_width(width), title)
     target = out or folder / FOLDER
-    files: list[Path] = []
+    files = []
     with console.status("drawing the figures"), accessing(target), writing_together(target) as partial:
         for named in folder_figures(folder, choice):
             made = save_figure(named.figure, partial / named.stem, formats, exact_width=True)

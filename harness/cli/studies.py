@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
     from servobench.harness.batch.sandbox import Workers
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.resolution import ResolvedRun
@@ -353,7 +352,7 @@ def analyse(
     from servobench.plant.contract.files import accessing, write_csv, writing_together
 
     runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
-    loops: list[LoopAnalysis] = []
+    loops = []
     for run in runs:
         with console.status(f"analysing {run.request.controller}"):
             try:

@@ -98,7 +98,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     Raises:
         ConfigurationError: an unreadable or malformed file, a malformed assignment, or two of one setting.
     """
-    sections: dict[str, Any] = {}
+    sections = {}
     if path is not None:
         sections = read_toml("configuration file", path)
         for name, section in sections.items():
@@ -116,7 +116,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
     """Return the fields of a configuration dataclass, or settings by nested keys, by dotted key."""
-    flat: dict[str, Any] = {}
+    flat = {}
     values = {each.name: getattr(config, each.name) for each in fields(config)} if is_dataclass(config) else config
     for name, value in values.items():
         if is_dataclass(value) or (config is values and isinstance(value, Mapping)):

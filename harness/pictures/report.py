@@ -225,7 +225,7 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
     least, most = CURVE_POINTS
     wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
     points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
-    curves: dict[str, Json] = {}
+    curves = {}
     for first in range(0, len(wanted), STEPS_AT_ONCE):
         for track in load_tracks(folder, wanted[first : first + STEPS_AT_ONCE], COLUMNS[:3]):  # the error over time
             bins = np.array_split(track.error(), min(points, len(track.table)))

@@ -214,7 +214,7 @@ def _undone(log: Log, model: RobotModel, others: Others, known: Mapping[str, flo
         return float(error.sum()) + sum(size**2 for size in robot.sizes().values())
 
     as_it_is = least = misfit(_Remedy("", log, model), known)
-    names: list[str] = []
+    names = []
     stages = ((_remedies, TIE),) if known else ((_remedies, GAIN), (_pairs, PAIR_GAIN))
     for remedies, gain in stages:
         tried = nsmallest(SCREENED, _placed(remedies(log, model, others), rows))

@@ -164,7 +164,7 @@ def _trace(error: BaseException) -> str:
     if isinstance(error, WrongAnswer) and (place := _beginning(error.method)):
         whole.stack = traceback.StackSummary.from_list([traceback.FrameSummary(*place)])
         return "".join(whole.format())
-    seen: set[int] = set()
+    seen = set()
     while shown is not None and id(shown) not in seen:
         seen.add(id(shown))
         inner = next((i for i, frame in enumerate(shown.stack) if not frame.filename.startswith(HARNESS)), 0)

@@ -147,7 +147,7 @@ def predicted_limits(
     own = {key: value for key, value in settings.sections.get(plant, {}).items() if key in known}
     latencies = [place.number / 1000.0 for place in KNOWN_LINES[LATENCY].places]
     run, config = settings.resolve("run", RunSettings()), Settings({plant: own}).resolve(plant, KinematicConfig())
-    limits: dict[str, float] = {}
+    limits = {}
     for name in controllers:
         entry = find_controller(name)
         if entry.side_by_side:
@@ -201,7 +201,7 @@ def _draw(
     """Draw a measure of the runs at each place of the map, with a title, its label and the upper edge of the panels."""
     controllers = list(dict.fromkeys(runs["controller"]))
     styles = style.method_styles(controllers)
-    curves: dict[str, Curves] = {}
+    curves = {}
     for axis, line in KNOWN_LINES.items():
         if axis in set(runs["axis"]):
             cells = dict(iter(runs[runs["axis"] == axis].groupby(["controller", "magnitude"])))

@@ -106,7 +106,7 @@ def bounded(judged: pd.DataFrame) -> pd.DataFrame:
 
 def methods_rows(judged: pd.DataFrame) -> list[Row]:
     """Return a row for each challenge, plant and method, best first: its good runs, median, lost runs, mean score."""
-    rows: list[Row] = []
+    rows = []
     for _, place in judged.groupby(["challenge", "plant"], sort=False):
         best = place[place["score"].notna()].drop_duplicates("seed")["reference"]
         about = {name: Cell(str(place[name].iloc[0])) for name in ("challenge", "grade", "plant", "measure")}
@@ -126,7 +126,7 @@ def methods_rows(judged: pd.DataFrame) -> list[Row]:
 
 def ranking_rows(judged: pd.DataFrame) -> list[Row]:
     """Return a row for each plant and method: rank, interquartile mean of its scores, lost runs and profile."""
-    rows: list[Row] = []
+    rows = []
     for plant, own in bounded(judged).groupby("plant", sort=False):
         shares = profile(own, FACTORS)
         for each in ranking(own):

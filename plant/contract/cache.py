@@ -86,7 +86,7 @@ def _folders(kind: str) -> list[Path]:
         ValueError: other users can write all of them.
     """
     user, temporary = _user_cache(), _temporary_cache()
-    folders: list[Path] = []
+    folders = []
     for root, may_be_shared in ((user, kind not in CODE), (temporary, False)):
         if root is not None and (may_be_shared or _is_private(root / kind)):
             folders.append(root / kind)

@@ -287,7 +287,7 @@ def divisions(text: str, mark: str) -> list[tuple[str, str]]:
 def split_words(text: str, known: Container[str] = ()) -> tuple[str, ...]:
     """Split a comma-separated list, in which a known name and a file that exists may have commas themselves."""
     parts = text.split(",")
-    words: list[str] = []
+    words = []
     while parts:
         for size in range(min(len(parts), MAX_COMMAS + 1), 0, -1):
             word = ",".join(parts[:size]).strip()

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -183,7 +183,7 @@ def sensor_settings(axes: Iterable[tuple[str, str, float | str]]) -> dict[str, f
     Raises:
         ValueError: a magnitude out of the bounds of its setting, or two families of noise.
     """
-    changes: dict[str, Any] = {}
+    changes = {}
     for name, written, size in axes:
         axis = SENSOR_AXES[name]
         check_field(name, SensingConfig, axis.setting, written if axis.units in (SHARE, NUMBER) else size)

@@ -182,7 +182,7 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
         ValueError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
     """
     known = [item.name for item in fields(cast(Any, default))]
-    changes: dict[str, Any] = {}
+    changes = {}
     for key, value in values.items():
         if key not in known:
             raise ValueError(f"{name} has no setting {key!r}: {_suggest_setting(key, default)}")

@@ -109,9 +109,9 @@ def _ways(tree: Any) -> Ways:  # noqa: ANN401
     lonely = [link for link in links if link not in ends]
     if lonely:
         remark(f"links without a joint are left out: {listed(lonely, 6)}")
-    ways: Ways = {}
+    ways = {}
     for link in links:
-        way: list[Any] = []
+        way = []
         place = link
         while place in above:
             way.append(above[place])

@@ -161,7 +161,7 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
 
     inputs = np.eye(2 * m + n)
     B, D = differences(np.zeros((len(inputs), len(packing.centre))), inputs)
-    shown: list[FloatArray] = []
+    shown = []
 
     def forward(directions: FloatArray) -> FloatArray:
         new, u = differences(directions.T, np.zeros((directions.shape[1], len(inputs))))
@@ -224,7 +224,7 @@ class Packing:
 
     def pack(self, state: ServoState, lanes: int) -> FloatArray:
         """Return the numbers of runs side by side, (lanes, s); with 0 lanes those of a single run, (1, s)."""
-        parts: list[FloatArray] = []
+        parts = []
 
         def noted(array: Any) -> Any:  # noqa: ANN401 - an array of any kind
             if np.issubdtype(array.dtype, np.floating):

@@ -322,7 +322,7 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
     Settings that cannot be built or whose loop bears no delay have the worst cost in every run, without a run.
     """
     requests = runs.runs()
-    lacking: dict[str, tuple[Ledger, Trial, Mapping[str, Any]]] = {}
+    lacking = {}
     for ledger, name, nested in wanted:
         if ledger.costs(nested) is not None or f"{name}{nested}" in lacking:
             continue
