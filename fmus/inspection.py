@@ -121,7 +121,7 @@ def validate_fmu(path: Path) -> Validation:
 
 
 def _odd_times(root: Path) -> Iterator[str]:
-    """Yield what is wrong with the times and the tolerance of the default experiment."""
+    """Yield the faults of the times and the tolerance of the default experiment."""
     experiment = "DefaultExperiment"
     start = read_time(root, experiment, "startTime", 0.0)
     stop = read_time(root, experiment, "stopTime", max(start, 0.0) + 1.0)

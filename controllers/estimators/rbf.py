@@ -146,7 +146,7 @@ class RbfEstimator(NetworkEstimator[RbfState]):
     _config: RbfConfig
 
     def start(self, jacobian: FloatArray) -> RbfState:
-        """Start from the offline network, whatever Ĵ₀ is."""
+        """Start from the offline network, without regard to Ĵ₀."""
         lead, window, (layers, units) = jacobian.shape[:-2], self._config.window, self._network.layers
         return RbfState(
             rows=self._started(jacobian),
@@ -220,7 +220,7 @@ class RbfLyapunovEstimator(NetworkEstimator[RbfLyapunovState]):
     _config: RbfLyapunovConfig
 
     def start(self, jacobian: FloatArray) -> RbfLyapunovState:
-        """Start from the offline network, whatever Ĵ₀ is."""
+        """Start from the offline network, without regard to Ĵ₀."""
         return RbfLyapunovState(self._started(jacobian), np.zeros(jacobian.shape[:-1]))
 
     def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:

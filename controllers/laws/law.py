@@ -61,7 +61,7 @@ class Law(ABC, Generic[State]):
         Args:
             state: after the command of this period.
             wanted: that command, (..., n), rad/s.
-            joint_velocity: what the stages that follow made of it, (..., n), rad/s.
+            joint_velocity: the output of the stages that follow, (..., n), rad/s.
         """
         del state, wanted
         return joint_velocity

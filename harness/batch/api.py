@@ -154,7 +154,7 @@ def compare(
     if resume and out is None:
         raise ConfigurationError("resume needs out, the folder to continue in")
     if current_process().name == GUARD and (isolate or run_timeout or run_memory or workers != 1 or out is not None):
-        raise SystemExit(START_ERROR)  # it imports a script without a guard; the process above says what to do
+        raise SystemExit(START_ERROR)  # it imports a script without a guard; the process above says the remedy
     with offering():
         names = tuple(choose_controller(each) for each in controllers)
         worlds = tuple(choose_plant(each) for each in plants)

@@ -1,7 +1,7 @@
 """Whether the row of a run fits itself and its steps, as one does that the harness has made.
 
-Code of users shares the process of its run and can write any row. What follows from the steps is computed again here,
-with the functions that made the row; the rest is compared within the row. A log that was falsified while it was written
+Code of users shares the process of its run and can write any row. Metrics of the steps are computed again here, with
+the functions that made the row; the rest is compared within the row. A log that was falsified while it was written
 has a row that fits it, and is not noticed.
 """
 

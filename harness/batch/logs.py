@@ -153,7 +153,7 @@ def _period(path: Path, table: pd.DataFrame) -> float:
 
 
 def _fitted_period(path: Path, times: FloatArray, tolerance: float) -> float:
-    """Return the period [s] of a clock whose stamps are off by a `tolerance` [s] at most; else say what they are."""
+    """Return the period [s] of a clock whose stamps are off by a `tolerance` [s] at most; else say how."""
     steps, rows = np.diff(times), np.arange(len(times))
     usual = float(np.median(times[2:] - times[:-2])) / 2.0
     period, begin = np.polyfit(rows, times - times[0], 1).tolist()

@@ -254,7 +254,7 @@ def limit_resources(memory: float) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     if memory < math.inf and LINUX:
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        soft = min(psutil.Process().memory_info().vms + int(memory), sys.maxsize)  # what the system can count
+        soft = min(psutil.Process().memory_info().vms + int(memory), sys.maxsize)  # the largest number of the system
         if hard == resource.RLIM_INFINITY or soft < hard:
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 

@@ -66,7 +66,7 @@ class PlantChecks:
     def __init__(self, entry: PlantEntry) -> None:
         """Prepare the checks."""
         self.entry, self._plants = entry, list[tuple[Plant, PlantSetup]]()
-        self._at_rest: list[tuple[FloatArray, FloatArray, Truth]] = []  # what `_drive` returned for each plant
+        self._at_rest: list[tuple[FloatArray, FloatArray, Truth]] = []  # results of `_drive` for each plant
         self._second = f"a period of {1e3 * OTHER[1]:g} ms" + ("" if entry.own_robot else f" and the robot {OTHER[0]}")
 
     @property

@@ -96,7 +96,7 @@ class CommitUnknown(Exception):
 
 @cache
 def read_checkout() -> tuple[str | None, str | None]:
-    """Return the commit of the checkout this code lies in, and why it is unknown; None for what does not apply.
+    """Return the commit of the checkout this code lies in, and why it is unknown; None where one does not apply.
 
     The commit is marked where code differs from it.
     """

@@ -1,7 +1,7 @@
 """Runs as environments of Gymnasium: `servobench/Servo-v0`. Needs the extra `gym`.
 
 Gymnasium 1 has no entry points by which a process could find names that it has not imported. So a process that imports
-this module also hands the name to processes that it starts by multiprocessing, whatever the start method.
+this module also hands the name to processes that it starts by multiprocessing, by every start method.
 """
 
 from multiprocessing import current_process

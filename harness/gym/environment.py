@@ -373,7 +373,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
         Args:
             num_envs: number of lanes.
-            max_episode_steps: length of an episode, for Gymnasium, which passes what `ServoEnv.spec` tells.
+            max_episode_steps: length of an episode, for Gymnasium, which passes that of `ServoEnv.spec`.
             choice: arguments of `ServoEnv`, which all runs share.
 
         Raises:

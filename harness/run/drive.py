@@ -67,7 +67,7 @@ def command_response(log: Log) -> Response | None:
         return None
     variance = left * correlation_time(solved.fun.reshape(-1, spec.n)) + 1e-16
     covariance = variance * np.linalg.pinv(solved.jac.T @ solved.jac)[:2, :2]
-    # What is left of a drive that is no first-order lag may be one of the delay, which the lag makes up for.
+    # The residual of a drive that is no first-order lag may be one of the delay, which the lag makes up for.
     covariance += 0.25 * left / late * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return Response(float(solved.x[0]), float(solved.x[1]), covariance, share, level)
 
@@ -80,7 +80,7 @@ def untold_response(log: Log) -> str:
 
 
 def command_mistake(log: Log) -> str:
-    """Name what is likely wrong with the commands of a log; empty for nothing, or no commands."""
+    """Name the likely fault of the commands of a log; empty for none, or no commands."""
     q, u, names = log.joints, log.commands, log.spec.joint_names
     if u is None or len(q) < 3:
         return ""

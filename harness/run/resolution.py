@@ -52,7 +52,7 @@ class Sections(dict[str, Any]):
         return self._changed[section, changes]
 
     def frames(self, plant: str, robot: Robot, period: float) -> Varied:
-        """Return what changes in the sensor of a plant where a run has another period [s] than the section `run`."""
+        """Return the changes in the sensor of a plant where a run has another period [s] than the section `run`."""
         if period == self["run"].period or (robot.camera is None and robot.twin is None):
             return ()
         if (plant, period) not in self._frames:

@@ -53,7 +53,7 @@ def estimates(robot: Identified, response: Response | None) -> pd.DataFrame:
 
 
 def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]:
-    """Return lines on a log: its noise, what remains unexplained, and what it does not tell."""
+    """Return lines on a log: its noise, its unexplained residuals, and the parameters that it leaves open."""
     scale, unit = (1e3, "mm") if log.spec.feature.unit == "m" else (1.0, log.spec.feature.unit)
     noise = ", ".join(f"{name} {scale * each:.2g}" for name, each in
                       zip(log.spec.feature_names, np.sqrt(np.diag(robot.noise)), strict=True))  # fmt: skip
@@ -82,7 +82,7 @@ def remarks(log: Log, robot: Identified, response: Response | None) -> list[str]
     lines += [f"not told: {each}" for each in untold_combinations(robot)]
     told = [name for name, told in zip(robot.names, robot.told, strict=True) if told and name not in EXTRAS]
     share, widest = max((robot.estimate(name)[1] / prior(name), name) for name in told)
-    longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)  # as the prior is no part of what a log tells
+    longer = 3.0 * float(np.ptp(log.time)) / (1.0 - share**2)  # as the prior is no part of a log's information
     lines.append(f"at most {longer:.0f} s more of such motion would halve the widest interval, that of {widest}")
     return lines
 
@@ -158,7 +158,7 @@ class Sensor(NamedTuple):
 
 
 def sensor(log: Log, robot: Identified) -> Sensor:
-    """Return what a log tells of sensor and mechanics.
+    """Return the sensor and the mechanics behind a log.
 
     Frames late by times of deviation σ leave residuals with E‖e‖² = tr Σ + σ² ‖ẏ‖² of a feature that moves at ẏ.
     """

@@ -19,7 +19,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
 STAMP: Final = re.compile(rb"Script Loaded \(([\w.: -]{1,40})\)")  # the date that a control script has in it
-SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")  # which no line of HTTP has, whatever its method
+SCRIPT_START: Final = re.compile(rb"def [A-Za-z_]\w*\(")  # which no line of HTTP has, with any method
 COMMAND: Final = "input_int_register_0"
 COMMANDS: Final = CONTROLLER["commands"]["names"].split()
 WITHOUT_ANSWER: Final = frozenset(CONTROLLER["commands"]["without_answer"])

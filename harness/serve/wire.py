@@ -1,8 +1,8 @@
 """RTDE packets: the variables of a UR's controller, recipes of them, and the bytes on the socket.
 
 A packet is big-endian: u16 size of the whole, u8 kind, body. A recipe is a list of variables that travel together.
-Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol versions 1 and 2; what version 1 leaves out
-agrees with Universal Robots' client library.
+Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol versions 1 and 2; the omissions of version 1
+agree with Universal Robots' client library.
 
 No request of HTTP begins a packet: its first byte is a printable character or the end of a line, and so is its second
 one, which as a size is above that of any packet. A TLS record begins with 0x16, likewise too large.

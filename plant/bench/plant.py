@@ -285,7 +285,7 @@ class World(Abilities):
         return None
 
     def rehearse(self) -> None:
-        """Remark on what is unlikely at the start of a run; the world has just been built and is closed afterwards.
+        """Remark on unlikely things at the start of a run; the world has just been built and is closed afterwards.
 
         Raises:
             RunFault: a step failed.

@@ -136,7 +136,7 @@ def _is_private(folder: Path) -> bool:
         writers = stat.S_IWOTH
         if found.st_gid != found.st_uid:
             writers |= stat.S_IWGRP
-        kept_apart = each != folder and found.st_mode & stat.S_ISVTX  # as in /tmp: what is inside stays its owner's
+        kept_apart = each != folder and found.st_mode & stat.S_ISVTX  # as in /tmp: entries stay their owners'
         if found.st_mode & writers and not kept_apart:
             return False
     return True

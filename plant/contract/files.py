@@ -210,7 +210,7 @@ def _plain_column(name: object) -> str:
 
 
 def numbers_of(what: str, table: Any, names: Sequence[str]) -> FloatArray:  # noqa: ANN401 - as above
-    """Return the numbers of columns of a DataFrame, (k, len(names)); `what` it is stands in error messages.
+    """Return the numbers of columns of a DataFrame, (k, len(names)); `what` names them in messages.
 
     Raises:
         ConfigurationError: one of them is missing or has something else than finite numbers, or there are no rows.

@@ -40,7 +40,7 @@ class Chain(NamedTuple):
     joints: list[Joint]
     flange: FloatArray  # (4, 4), the tip in the frame of the last joint
     tip: str  # link that carries the ball
-    ending: str  # what was taken as the tool, and which chains are as long; empty for none
+    ending: str  # the joints taken as the tool, and other chains as long; empty for none
 
 
 def find_chain(tree: Any, tip: str) -> Chain:  # noqa: ANN401 - yourdfpy is not typed
@@ -98,7 +98,7 @@ def _ways(tree: Any) -> Ways:  # noqa: ANN401
         if lost:
             raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(lost)!r}")
     if not links or not tree.joints:
-        raise ValueError("it has no links and joints; of a xacro file, take what `xacro FILE` prints")
+        raise ValueError("it has no links and joints; of a xacro file, take the output of `xacro FILE`")
     roots = sorted(ends - set(above))
     if len(roots) > 1:
         raise ValueError(f"both {' and '.join(roots)} are without a parent: a joint is missing or turned round")
@@ -185,7 +185,7 @@ def _fingers(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
 
 
 def _ending(tree: Any, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -> str:  # noqa: ANN401
-    """Return what follows after the last joint of a chain, and which other chains are as long.
+    """Return a line on the joints after the last one of a chain, and on other chains as long.
 
     Raises:
         ValueError: an axis follows that is not modelled.

@@ -46,7 +46,7 @@ CHILDREN: Final[Mapping[str, tuple[str, ...]]] = {  # element -> known elements 
 }
 ENDS: Final = ("parent", "child")
 GEOMETRY: Final = ("origin", "axis", "limit", "mimic")  # elements of a joint whose values are geometry
-SIMILAR: Final[Mapping[str, tuple[str, ...]]] = {  # element -> what an unknown element in it may have been meant as
+SIMILAR: Final[Mapping[str, tuple[str, ...]]] = {  # element -> likely meanings of an unknown element in it
     "robot": ("link", "joint"),
     "link": ("link", "joint"),
     "inertial": ("origin",),
@@ -71,7 +71,7 @@ DYNAMIC: Final = re.compile(
 NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 INFINITE: Final = re.compile(r"[-+]?inf(inity)?", re.IGNORECASE)
 ZEROS: Final = re.compile(r"[-+.0\s]*")
-REMEDIES: Final = (  # what a word that is no number has in it, and what is to be done
+REMEDIES: Final = (  # mark in a word that is no number, and remedy
     (re.compile(r"[${}()*/]|pi"), RUN_XACRO),
     (re.compile(","), "numbers have a decimal point and blanks between them"),
     (re.compile("[a-zA-Zµ°]"), "units cannot be written: lengths are in m, angles in rad, masses in kg"),
@@ -156,7 +156,7 @@ def _refuse_xacro(root: Any) -> None:  # noqa: ANN401
 
 
 def _copy_robot(root: Any, passed: dict[str, None]) -> ET.Element:  # noqa: ANN401
-    """Return what an arm needs of a robot."""
+    """Return a robot with the parts that an arm needs."""
     if not root.get("name"):
         raise ValueError("<robot> has no name")
     robot = ET.Element("robot", name=root.get("name"))
@@ -183,12 +183,12 @@ def _copy_robot(root: Any, passed: dict[str, None]) -> ET.Element:  # noqa: ANN4
 
 
 def _copy(source: Any, place: str, passed: dict[str, None]) -> ET.Element:  # noqa: ANN401
-    """Return what an arm needs of an element.
+    """Return an element with the parts that an arm needs.
 
     Args:
         source: a link, a joint or an element in one.
         place: the link or joint, for messages.
-        passed: takes what is left out and may matter to the user.
+        passed: takes parts that are left out and may matter to the user.
 
     Raises:
         ValueError: a value is malformed, something that may carry geometry is not known, or a needed part is missing.
@@ -218,7 +218,7 @@ def _copy(source: Any, place: str, passed: dict[str, None]) -> ET.Element:  # no
 
 
 def _copy_part(part: Any, copy: ET.Element, place: str, passed: dict[str, None]) -> None:  # noqa: ANN401
-    """Append what an arm needs of a part of an element to the element's copy."""
+    """Append a part of an element, as far as an arm needs it, to the element's copy."""
     tag = _tag(part)
     known = CHILDREN.get(copy.tag, ())
     if tag not in known:
@@ -301,7 +301,7 @@ def _turn_by_quaternion(origin: ET.Element, place: str) -> None:
 
 
 def _check_joint(joint: ET.Element, place: str) -> None:
-    """Refuse a joint that lacks what a URDF demands, or has an unknown type."""
+    """Refuse a joint that lacks a required element or attribute, or has an unknown type."""
     kind = joint.get("type", "")
     if kind not in TYPES:
         raise ValueError(f"{place} has the type {kind!r}; {suggest(kind, TYPES)}")

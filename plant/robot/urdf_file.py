@@ -74,7 +74,7 @@ def _arm(chain: Chain) -> SerialArm:
 
 def _limits(joints: list[Any]) -> JointLimits:
     """Return the limits; soft limits of a safety controller count where they are narrower."""
-    told = defaultdict[str, list[str]](list)  # remark -> what it is about
+    told = defaultdict[str, list[str]](list)  # remark -> limits or joints
     rows = []
     for joint in joints:
         name = f"joint {joint.name!r}"
@@ -122,7 +122,7 @@ def _links(tree: Any, chain: list[Joint], arm: SerialArm, flaws: list[str]) -> t
         tree: the file.
         chain: the joints.
         arm: of these joints.
-        flaws: takes what no body has.
+        flaws: takes values that no body has.
     """
     inertials = {link.name: link.inertial for link in tree.links}
     own = [inertials[link.joint.child] for link in chain]

@@ -294,7 +294,7 @@ def search_workspace(arm: SerialArm, limits: Pair, shapes: Pair) -> Workspace | 
 
 
 def _at_height(arm: SerialArm, limits: Pair, shapes: Pair, height: float) -> Found | None:
-    """Return the fit share of the box at a height and what makes its workspace; None where no home is found."""
+    """Return the fit share of the box at a height and the parts of its workspace; None where no home is found."""
     scale = length_scale(arm)
     lift = np.array([0.0, 0.0, height])
     centre = scale * (np.array(CENTRE) + lift)
