@@ -32,7 +32,7 @@ ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
 } | {"panda": panda}
 """The arms by their makers' tables; each is made once."""
 WITH: Final = " with "  # between a robot and the file of its camera
-SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf")  # that files of robots have
+SUFFIXES: Final = (".yaml", ".yml", ".toml", ".urdf", ".xacro")  # that files of robots have, and one that is refused
 
 
 def find_robot(text: str) -> Robot:
