@@ -10,8 +10,10 @@ may have suffered from an earlier one in the same process. As a block is never s
 costs at most the time of the runs once more. The one module that imports Dask.
 """
 
+import asyncio
 import contextlib
 import json
+import logging
 import math
 import pickle
 import re
@@ -448,9 +450,12 @@ def _open_cluster(scheduler: str) -> Iterator[Executor]:
         raise ConfigurationError(f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}")
     from distributed import Client  # noqa: PLC0415 - only the extra cluster brings it
 
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it reports the end of a scheduler with traces
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
+        asyncio.run(_call(scheduler))
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, MemoryError) as error:  # the bytes of another program may pass for a size
         raise ConfigurationError(
             f"the scheduler {scheduler} does not answer; start one with `dask scheduler --host 127.0.0.1` and name "
             "its address"
@@ -463,6 +468,14 @@ def _open_cluster(scheduler: str) -> Iterator[Executor]:
                 f"the scheduler {scheduler} has no workers; start some with `dask worker {scheduler} --nthreads 1`"
             ) from error
         yield client.get_executor(pure=False)
+
+
+async def _call(scheduler: str) -> None:
+    """Connect to a scheduler once: a client that cannot connect would go on trying while it is destroyed."""
+    import distributed  # noqa: PLC0415 - as above
+
+    link = await distributed.comm.connect(scheduler, timeout=SCHEDULER_TIMEOUT)
+    await link.close()
 
 
 def _workers_of(executor: Executor, count: int) -> Workers:

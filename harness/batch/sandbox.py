@@ -322,7 +322,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
     except (EOFError, OSError):  # the other side has ended
         pass
     finally:
-        guard.end_runner()
+        guard.close()
         processes.send([tracker] if tracker else [], signal.SIGCONT)  # a stopped one does not notice that it is to end
 
 
@@ -439,6 +439,11 @@ class _Guard:
             return False
         below = processes.descendants(os.getpid())
         return len(below) > 1 or processes.resident_memory(below) > KEPT_SHARE * self._limits.memory
+
+    def close(self) -> None:
+        """End the runner, and close the file of its traces."""
+        self.end_runner()
+        self._trace.close()
 
     def end_runner(self) -> None:
         """End the runner and every process that runs have left behind."""

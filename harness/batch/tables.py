@@ -25,6 +25,7 @@ ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while 
 MAX_COLUMNS, MAX_NAME = 10_000, 200  # of a table, and letters of the name of one
 MAX_CELLS, MAX_CELLS_A_BYTE = 2 * 10**7, 100  # of a table of any size, and for each byte of its file
 MAX_TIME: Final = 1e9  # [s] of a step, which other formats count in nanoseconds
+NO_THREAD: Final = "launch worker thread"  # in a message of Arrow
 BATCH: Final = b"servobench.batch"  # key of the batch whose rows a table holds
 
 
@@ -210,6 +211,9 @@ def reading(folder: Path, name: str) -> Iterator[None]:
         raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         why = " ".join(str(error).split()) or type(error).__name__
+        if NO_THREAD in why:
+            limit = "no more threads or processes may be started here: ulimit -u"
+            raise ConfigurationError(f"{folder / name} cannot be read, as {limit}") from error
         raise DamagedFile(folder, name, f"cannot be read ({why[:160].rstrip('.')})") from error
 
 

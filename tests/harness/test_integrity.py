@@ -418,3 +418,9 @@ def test_a_manifest_of_another_schema_is_not_written_anew(begun):
     (begun / results.MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(ConfigurationError, match="has results of schema '3'; this servobench reads '4'; the column"):
         run(begun, resume=True)
+
+
+def test_a_table_for_which_no_thread_may_start_is_not_called_damaged(tmp_path):
+    said = "runs.parquet cannot be read, as no more threads or processes may be started here: ulimit -u"
+    with pytest.raises(ConfigurationError, match=said), tables.reading(tmp_path, "runs.parquet"):
+        raise OSError("Failed to launch worker thread: Resource temporarily unavailable")
