@@ -58,7 +58,7 @@ def find_robot(text: str) -> Robot:
             raise ValueError(f"robot {text!r}: {RANDOM_ARM} needs a colon and a number, such as {RANDOM_ARM}:7")
         return random_robot(int(number))
     path = user_path(word.robot)
-    if path.suffix.lower() == ".xacro":
+    if PurePath(text.partition("#")[0]).suffix.lower() == ".xacro":
         raise ValueError(f"robot {text!r} is a xacro file: {RUN_XACRO}")
     if not _is_robot_file(word.robot):
         kinds = "a factory calibration (.yaml), a DH table (.toml) or a .urdf"

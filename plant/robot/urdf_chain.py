@@ -2,12 +2,14 @@
 
 Unless a tip is named, the chain with the most rotating joints is taken, of those that end before the tool. A tool
 begins after three rotating joints or more with a joint that others mimic, with one that is called a gripper, or with
-fingers: chains that branch from one link, have similar lengths and are not longer than the arm. No other rotating joint
-follows after it. Sliding joints are in no chain: at its end those of fingers belong to the tool, an axis is refused.
+fingers: chains that branch from one link, have similar lengths, are not longer than the arm and, if two, mirrored. No
+other rotating joint follows after it. Sliding joints are in no chain: at its end those of fingers belong to the tool,
+an axis is refused.
 """
 
 import re
 from collections import Counter, defaultdict
+from math import isclose
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,6 +24,7 @@ FINGER: Final = re.compile(r"finger|thumb|knuckle|jaw|claw", re.IGNORECASE)  # i
 GRIPPER: Final = re.compile(f"{FINGER.pattern}|gripper", re.IGNORECASE)  # in that of a joint
 WRIST: Final = re.compile(r"wrist|(?<!t)roll|rot|yaw|pitch|base|flange|mount", re.IGNORECASE)  # turns a whole gripper
 MAX_STROKE: Final = 0.1  # [m] longest travel of a sliding joint that is a finger without a name or a companion
+MIRRORED: Final = 0.01  # [1] largest relative difference of the distances of two fingers from their palm
 LENGTHS: Final = Check.of(Lengths, bare=True)
 Ways = dict[str, list[Any]]  # link -> joints from the root to it, as yourdfpy reads them
 
@@ -165,23 +168,41 @@ def _tool(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
 def _fingers(tree: Any, ways: Ways) -> dict[str, str]:  # noqa: ANN401
     """Return the rotating joints of fingers, which may mimic others, as `_tool` does."""
     lengths = dict.fromkeys(ways, 0)  # link -> most rotating joints after it
-    branches = defaultdict[str, list[int]](list)
+    branches = defaultdict[str, list[tuple[int, Any]]](list)
     for joint in sorted(tree.joints, key=lambda joint: -len(ways[joint.child])):
         length = lengths[joint.child] + (joint.type in TURNING)
         lengths[joint.parent] = max(lengths[joint.parent], length)
-        branches[joint.parent].append(length)
+        branches[joint.parent].append((length, joint))
     hands = {}
-    for link, spans in branches.items():
-        longest, *others = sorted(spans, reverse=True)
-        alike = [span for span in others if 2 * span >= longest > 0]
-        if alike and _count(ways[link]) >= max(MIN_JOINTS, longest):
-            hands[link] = f"one of {1 + len(alike)} fingers"
+    for link, parts in branches.items():
+        longest = max(length for length, _ in parts)
+        alike = [(length, joint) for length, joint in parts if 2 * length >= longest > 0]
+        is_palm = len(alike) > 1 and _count(ways[link]) >= max(MIN_JOINTS, longest)
+        if is_palm and _are_fingers(alike):
+            hands[link] = f"one of {len(alike)} fingers"
     found = {}
     for joint in filter(turns, tree.joints):
         palms = [before.parent for before in ways[joint.child] if before.parent in hands]
         if palms:
             found[joint.name] = hands[palms[0]]
     return found
+
+
+def _are_fingers(branches: list[tuple[int, Any]]) -> bool:
+    """Return whether branches of one link are fingers: more than two, or called so, or two that mirror each other.
+
+    A camera that turns and a bar beside the wrist are no fingers.
+    """
+    if len(branches) > 2:
+        return True
+    lengths = set[int]()
+    reaches = list[float]()
+    for length, joint in branches:
+        if GRIPPER.search(f"{joint.name} {joint.child}"):
+            return True
+        lengths.add(length)
+        reaches.append(float(np.linalg.norm(pose_of(joint.origin)[:3, 3])))
+    return len(lengths) == 1 and isclose(*reaches, rel_tol=MIRRORED)
 
 
 def _ending(tree: Any, ways: Ways, free: Ways, tip: str, tool: dict[str, str]) -> str:  # noqa: ANN401

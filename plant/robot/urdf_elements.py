@@ -160,6 +160,9 @@ def _copy_robot(root: Any, passed: dict[str, None]) -> ET.Element:  # noqa: ANN4
     if not root.get("name"):
         raise ValueError("<robot> has no name")
     robot = ET.Element("robot", name=root.get("name"))
+    for name in root.attrib:
+        if ":" not in name and name not in ("name", "version"):
+            passed[f"{name} of <robot>, which is left out"] = None
     names = list[str]()
     for part in root:
         tag = _tag(part)

@@ -51,7 +51,10 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         arm = _arm(chain)
         limits = _limits([link.joint for link in chain.joints])
         links, note = _links(tree, chain.joints, arm, flaws)
-        workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        try:
+            workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        except ValueError as error:
+            raise ValueError("; ".join(filter(None, (str(error), chain.ending)))) from error
     flaw = ""
     if flaws:
         flaw = flaws[0]

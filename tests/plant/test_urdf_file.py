@@ -300,6 +300,9 @@ STROKE = '<limit lower="0" upper="0.05" effort="1" velocity="1"/>'
         ),
         ([row for k in "ab" for row in arm_joints(6, k)], 6, "alink_6", "as many joints lead to #blink_6"),
         ([*ARM, ("camera", "revolute", "link_2", "eye")], 6, "link_6", "^$"),
+        ([*ARM, ("pan", "revolute", "link_5", "eye")], 6, "link_6", "as many joints lead to #eye"),
+        ([*ARM, ("bar", "revolute", "link_3", "rod"), ("end", "revolute", "rod", "rod_end")], 6, "link_6", "^$"),
+        ([*ARM, ("bar", "revolute", "link_4", "rod"), ("end", "revolute", "rod", "rod_end")], 6, "link_6", "#rod_end"),
         ([*ARM, ("bar", "revolute", "link_1", "rod", '<mimic joint="joint_2"/>')], 6, "link_6", "^$"),
         ([*ARM, ("bar", "revolute", "link_3", "rod", '<mimic joint="joint_4"/>')], 6, "link_6", "^$"),
         ([*ARM, ("a", "fixed", "link_6", "ft"), ("b", "fixed", "ft", "flange")], 6, "ft", "^$"),
@@ -382,3 +385,16 @@ def test_an_engine_does_not_take_a_robot_whose_inertia_no_body_has(tmp_path, cap
     assert "; the physics engines refuse it" in caplog.text
     with pytest.raises(ValueError, match="robot arm: link 'link_1': no body has"):
         MUJOCO.build(configure(RenderedConfig), replace(setup(), nominal=robot))
+
+
+def test_an_arm_that_finds_no_posture_says_what_was_left_out(tmp_path):
+    fingers = [(f"finger_{i}", "revolute", "link_6", f"tip_{i}") for i in range(2)]
+    lying = [(*joint[:4], '<origin xyz="0 0 0.001"/>') for joint in ARM]
+    path = write(tmp_path, urdf_of(*lying, *fingers), "arm.urdf")
+    with pytest.raises(ValueError, match=r"no posture .*; the tool, at rest, begins with finger_0"):
+        find_robot(str(path))
+
+
+def test_an_attribute_of_the_robot_that_may_scale_it_is_named(tmp_path, caplog):
+    chain_of(tmp_path, ODD.replace("<robot ", '<robot scale="0.001" '))
+    assert "scale of <robot>, which is left out" in caplog.text
