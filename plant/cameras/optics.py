@@ -234,9 +234,14 @@ def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArra
     """
     half = 0.5 * np.array(optics.size)
     inside = (np.abs(project(points, optics) - half) <= share * half).all(axis=-1)
+    turning = None
     if optics.further is not None:
+        turning = optics.further[..., 5]
+    elif (optics.distortion < 0.0).any():
+        turning = 1.0 / (3.0 * np.maximum(-optics.distortion, 1e-12))  # r² at which r (1 + k r²) turns back
+    if turning is not None:
         a = points[..., :2] / _depth(points)
-        inside &= np.vecdot(a, a) <= optics.further[..., 5, None]
+        inside &= np.vecdot(a, a) <= turning[..., None]
     return np.asarray(inside & (points[..., 2] > NEAR))
 
 

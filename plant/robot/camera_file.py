@@ -52,6 +52,7 @@ MAX_ANGLE: Final = math.atan(math.sqrt(ENDLESS))  # [rad] from the optical axis 
 ROUNDED_ROOT: Final = 1e-9  # [1] by which the root of a polynomial is off at most
 MIN_AHEAD: Final = 0.5  # usual cosine of the angle between the z axes of camera and flange
 IN_STEP: Final = 2e-4  # [1] largest deviation of whole control periods from a frame that is in step with them
+MAX_ROUNDED: Final = 0.015  # [1] by which a frame of whole milliseconds may differ from the camera's
 ROUNDED: Final = 1e-3  # largest error of a rotation whose numbers were rounded
 Row = tuple[Number, ...]
 
@@ -189,12 +190,14 @@ def frame_time(what: str, rate: float, period: float) -> float:
     It is a multiple of the control `period` [s] where the two are nearly in step, and else that of the rate; where two
     or more are delivered in each period, one arrives at every control instant: 0.
     """
-    frames, whole = rate * period, max(1, round(1e3 / rate)) / 1e3
+    frames = rate * period
+    whole = max(1, round(1e3 / rate)) / 1e3
     if round(frames) > 1 and abs(frames / round(frames) - 1.0) < ROUNDED:
         return 0.0
     if abs(max(1, round(1.0 / frames)) * frames - 1.0) < IN_STEP:
         return round(1.0 / frames) * period
-    if abs(round(whole / period) * period - whole) <= ROUNDED * period:
+    near = abs(whole * rate - 1.0) < MAX_ROUNDED
+    if near and abs(round(whole / period) * period - whole) <= ROUNDED * period:
         return whole
     clocks = f"a frame takes {1e3 / rate:g} ms and a control period {1e3 * period:g} ms"
     remark(f"{what}: {clocks}, so delays change; run.period={rate:.9g}Hz helps")
@@ -289,7 +292,8 @@ def _named_coefficients(lens: str, given: Mapping[str, float]) -> tuple[str, tup
     if not lens and {"k4", "k5", "k6"} <= set(given):
         lens = "rational_polynomial"
     lens = lens or "plumb_bob"
-    if unknown := sorted(set(given) - set(LENSES[lens])):
+    unknown = sorted(name for name, value in given.items() if value and name not in LENSES[lens])
+    if unknown:
         raise ValueError(f"distortion has no coefficient {unknown[0]!r} in {lens}; wanted distortion_model {WANTED}")
     return _least_lens(lens, tuple(given.get(name, 0.0) for name in LENSES[lens]))
 

@@ -6,6 +6,7 @@ VINS (camodocal), where the fisheye's k₁ … k₄ are k2 … k5, and those of 
 
 import re
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,8 +32,9 @@ COEFFICIENTS: Final[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5"
 FISHEYE: Final[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
 PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
-DISTORTION: Final = re.compile(r"dist(?!ance)", re.IGNORECASE)  # in names of keys
-EXPONENT: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+# In names of keys, or whole names.
+DISTORTION: Final = re.compile(r"dist(?!ance)|coeff|radial|tangential|^kc$|^[kp]_?\d$", re.IGNORECASE)
+NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]\.\d+")  # that PyYAML takes for texts
 
 
 def plain_name(text: str) -> str:
@@ -52,18 +54,21 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     found = _flat(_first_camera(path, found))
     keys = dict[str, Any]()
     for key, names in NAMES.items():
-        given = [found[name] for name in names if name in found]
-        if given:
-            keys[key] = _data(given[0])
+        given = {name: _data(found[name]) for name in names if name in found}
+        for name, value in given.items():
+            if value != keys.setdefault(key, value):
+                raise ValueError(f"{path.name} has {next(iter(given))} and another {name}; leave one out")
     _check_part(path, found, keys)
+    projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
+    if projection and "matrix" not in keys:
+        raise ValueError(f"{path.name} is of the projection {projection!r}, which is not known or lacks its numbers")
     if any(name not in keys for name in ("width", "height", "matrix")):
         lacking = next(name for name in ("width", "height", "matrix") if name not in keys)
         raise ValueError(f"{path.name} has no {NAMES[lacking][0]}")
-    if "distortion" not in keys and (other := [name for name in found if _is_distortion(name)]):
+    if "distortion" not in keys and (other := _distortions(found)):
         raise ValueError(f"{path.name} has {other[0]!r}; wanted the name distortion_coefficients")
     if "distortion_model" in keys:
         keys["distortion_model"] = keys["distortion_model"] or "none"  # an empty one stands for none in ROS
-    projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
     if projection and plain_name(projection) not in PINHOLES:
         keys["distortion_model"] = projection
     if found.get("fisheye_model"):
@@ -82,12 +87,12 @@ def _parse(path: Path) -> Any:  # noqa: ANN401 - any content
     import yaml  # noqa: PLC0415 - few runs have such a file
 
     class Loader(yaml.SafeLoader):
-        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05, which are texts in YAML 1.1."""
+        """Reads OpenCV's matrices as mappings, and numbers such as 1e-05 and -.2, which are texts in YAML 1.1."""
 
     def mapping(loader: Any, node: Any) -> Any:  # noqa: ANN401 - PyYAML's
         return loader.construct_mapping(node, deep=True)
 
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+.0123456789"))
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", NUMBER, list("-+.0123456789"))
     for tag in ("opencv-matrix", "opencv-nd-matrix"):
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", mapping)
     text = read_text("file", path)
@@ -137,19 +142,33 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
     return keys
 
 
-def _is_distortion(name: str) -> bool:
+def _distortions(found: Mapping[str, Any]) -> list[str]:
+    """Return the names of keys, also in a section, that may hold a distortion and are not known."""
     known = (*NAMES["distortion_model"], *PARTS)
-    return name not in known and DISTORTION.search(name) is not None
+    names = list[str]()
+    for name, value in found.items():
+        names.append(name)
+        if isinstance(value, dict):
+            names += map(str, value)
+    return [name for name in names if name not in known and DISTORTION.search(name)]
 
 
 def _data(value: Any) -> Any:  # noqa: ANN401 - a value of a file
-    """Return the numbers of a matrix as a flat list, and other values as they are."""
+    """Return the numbers of a matrix as a flat list, and other values as they are.
+
+    Raises:
+        ValueError: a cell of a matrix is no finite number.
+    """
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     if value is None:
         return []
     if isinstance(value, list):
-        return np.array(value, dtype=object).ravel().tolist()
+        cells: list[Any] = np.array(value, dtype=object).ravel().tolist()
+        for cell in cells:
+            if not isinstance(cell, int | float) or not isfinite(cell):
+                raise ValueError(f"a matrix must hold finite numbers, got {cell!r}")
+        return cells
     return value
 
 

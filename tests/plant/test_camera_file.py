@@ -294,11 +294,40 @@ def test_coefficients_that_are_not_those_of_their_model_are_refused(write, model
         read_camera(write(text, "ros.yaml"))
 
 
-def test_a_distortion_under_a_name_that_is_not_known_is_no_ideal_camera(write):
-    with pytest.raises(ValueError, match="ros.yaml has 'distortion'; wanted the name distortion_coefficients"):
-        read_camera(write(ROS.replace("distortion_coefficients", "distortion"), "ros.yaml"))
+@pytest.mark.parametrize("name", ["distortion", "coeffs", "kc", "radial", "K1", "RadialDistortion"])
+def test_a_distortion_under_a_name_that_is_not_known_is_no_ideal_camera(write, name):
+    for text in (name, f"lens: {{{name}: 0.1}}\nunknown"):
+        with pytest.raises(ValueError, match=f"ros.yaml has '{name}'; wanted the name distortion_coefficients"):
+            read_camera(write(ROS.replace("distortion_coefficients", text), "ros.yaml"))
+
+
+def test_a_projection_that_is_not_known_is_named(write):
     with pytest.raises(ValueError, match="distortion_model 'omni' is not known"):
         read_camera(write(TOOLS["kalibr"].replace("pinhole", "omni"), "tool.yaml"))
+    with pytest.raises(ValueError, match="tool.yaml is of the projection 'ds', which is not known or lacks its"):
+        read_camera(
+            write(TOOLS["kalibr"].replace("pinhole", "ds").replace("intrinsics: [", "intrinsics: [-0.2, "), "tool.yaml")
+        )
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ("['0.1', 0, 0, 0, 0]", "a matrix must hold finite numbers, got '0.1'"),
+        ("[.nan, 0, 0, 0, 0]", "a matrix must hold finite numbers, got nan"),
+        ("[0, 0, 0, 0, 0]\nD: [0.1, 0, 0, 0, 0]", "ros.yaml has distortion_coefficients and another D; leave one out"),
+    ],
+)
+def test_numbers_that_are_none_or_contradict_each_other_are_refused(write, data, said):
+    with pytest.raises(ValueError, match=said):
+        read_camera(write(ROS.replace("{rows: 1, cols: 5, data: " + BENT + "}", data), "ros.yaml"))
+
+
+def test_zeros_by_other_names_and_numbers_that_begin_with_a_point_are_read(write):
+    text = ROS.replace(
+        "{rows: 1, cols: 5, data: " + BENT + "}", "{k1: .12, k2: -.25, k4: 0, p1: .002, p2: -.001, k3: .08}"
+    )
+    assert read_camera(write(text, "ros.yaml")).distortion == D
 
 
 @pytest.mark.parametrize(
@@ -423,3 +452,16 @@ def test_the_camera_and_the_controller_keep_time(write, caplog, rate, period, fr
     assert not caplog.text
     camera.sensing(SensingConfig(), 0.047)
     assert f"so delays change; run.period={rate}Hz helps" in caplog.text
+
+
+def test_a_drawn_distortion_shows_nothing_behind_its_fold():
+    optics = Optics(np.array([600.0]), np.array([[320.0, 240.0]]), np.array([-0.05]), (640.0, 480.0))
+    angle = np.radians([20.0, 77.4])  # r (1 - 0.05 r²) turns back at 68.8°
+    points = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=-1)[None]
+    assert (np.abs(project(points, optics)[0] - (320.0, 240.0)) < 240.0).all()
+    np.testing.assert_array_equal(in_image(points, optics), [[True, False]])
+
+
+def test_a_rate_that_is_no_whole_number_of_milliseconds_is_not_that_of_the_control(write):
+    camera = read_camera(write(f"rate = 120\n{CAMERA}"))
+    assert camera.sensing(SensingConfig(), 0.008).frame_period == pytest.approx(1.0 / 120.0, abs=1e-12)
