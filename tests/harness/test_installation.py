@@ -82,11 +82,11 @@ def test_the_version_says_why_the_commit_is_unknown(checkout, monkeypatch):
 
 
 def test_the_loaded_blas_is_named_with_its_version_kernel_and_threads():
-    known = {each["internal_api"]: each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas"}
-    for each in blas_libraries():
-        assert each["version"] == known[each["name"]]["version"]
-        assert each["threads"] == known[each["name"]]["num_threads"]
-        assert each["kernel"] == known[each["name"]].get("architecture")
+    told = [(each["name"], each["version"], each["threads"], each["kernel"]) for each in blas_libraries()]
+    known = [each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas"]
+    assert told == [
+        (each["internal_api"], each["version"], each["num_threads"], each.get("architecture")) for each in known
+    ]
 
 
 def test_a_blas_that_cannot_be_asked_has_the_name_that_numpy_was_built_with(monkeypatch):

@@ -124,7 +124,7 @@ def test_a_mapped_plant_has_the_name_that_a_user_gives_it():
     assert choose_plant("lab=./cell.TOML") == "lab"
     assert not is_foreign_plant("lab", trusted=True)
     assert is_foreign_plant("lab")
-    with pytest.raises(ConfigurationError, match=r"plant no\.fmu needs a mapping"):
+    with pytest.raises(ConfigurationError, match=r"fmu file no\.fmu does not exist"):
         choose_plant("lab=no.fmu")
     with pytest.raises(ConfigurationError, match="a plant called 'kinematic' exists already"):
         choose_plant("kinematic=cell.TOML")
