@@ -226,16 +226,13 @@ def resident_memory(processes: Iterable[int]) -> int:
 
 
 def own_memory(processes: Iterable[int]) -> int:
-    """Return the memory [bytes] that processes hold, each with its part of shared memory."""
-    return sum(_own_memory_of(process) for process in processes)
-
-
-def _own_memory_of(process: int) -> int:
-    """Return the memory [bytes] of a process; all that it shares counts where the system does not say its part."""
-    held = _ask(process, lambda each: each.memory_full_info())
-    if held is None:
-        return resident_memory([process])
-    return int(getattr(held, "pss" if LINUX else "uss", held.rss))
+    """Return the memory [bytes] of processes, each with its part of shared memory, or all where it is unknown."""
+    part = "pss" if LINUX else "uss"
+    total = 0
+    for process in processes:
+        held = _ask(process, lambda each: each.memory_full_info())
+        total += getattr(held, part, None) or resident_memory([process])
+    return total
 
 
 def _ask(process: int, question: Callable[[psutil.Process], Any]) -> Any:  # noqa: ANN401 - any answer

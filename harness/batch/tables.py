@@ -300,31 +300,35 @@ def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
     Raises:
         ConfigurationError: names the table, the column and the row.
     """
+    if fault := _fault_of_runs(runs):
+        raise ConfigurationError(f"{path} is no table of runs: {fault}")
+
+
+def _fault_of_runs(runs: pd.DataFrame) -> str:
     for name in NEEDED["runs"]:
         if (empty := runs[name].isna().to_numpy()).any():
-            raise ConfigurationError(f"{path} is no table of runs: row {empty.argmax()} has no {name}")
+            return f"row {empty.argmax()} has no {name}"
     if "settling_time_s" not in runs and (runs["status"] == COMPLETED).any():
-        raise ConfigurationError(f"{path} is no table of runs: it lacks the column settling_time_s")
+        return "it lacks the column settling_time_s"
     least, most = runs.min(numeric_only=True).to_dict(), runs.max(numeric_only=True).to_dict()
     for name in [each for each in MOST if each in least]:
         is_huge = runs[name].between(MAX_NUMBER, math.inf, inclusive="neither").any()
         if least[name] < 0.0 or most[name] > MOST[name] or is_huge:
-            raise ConfigurationError(f"{path} is no table of runs: {name} is {min(least[name], 0.0) or most[name]:g}")
+            return f"{name} is {min(least[name], 0.0) or most[name]:g}"
     taken: dict[str, int] = {}
     for row, run_id in enumerate(runs["run_id"]):
         if not isinstance(run_id, str) or RUN_ID.fullmatch(run_id) is None:
-            raise ConfigurationError(
-                f"{path} is no table of runs: the run_id of row {row}, {str(run_id)[:60]!r}, is unfit for the name of "
-                "a file; it has letters, digits and . = + _ - only, and does not begin with a dot"
+            return (
+                f"the run_id of row {row}, {str(run_id)[:60]!r}, is unfit for the name of a file; it has letters, "
+                "digits and . = + _ - only, and does not begin with a dot"
             )
         name = run_id.casefold()
         if name.partition(".")[0] in OWN_STEMS:
-            raise ConfigurationError(
-                f"{path} is no table of runs: the run_id of row {row}, {run_id!r}, is a name of its folder"
-            )
+            return f"the run_id of row {row}, {run_id!r}, is a name of its folder"
         before = taken.setdefault(name, row)
         if before != row:
-            raise ConfigurationError(
-                f"{path} is no table of runs: rows {before} and {row} have the run_id {run_id!r}, in which capitals do "
-                "not count; restore the table from a copy"
+            return (
+                f"rows {before} and {row} have the run_id {run_id!r}, in which capitals do not count; restore the "
+                "table from a copy"
             )
+    return ""

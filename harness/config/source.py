@@ -144,16 +144,14 @@ def check_present_folder() -> None:
 @contextlib.contextmanager
 def same_folder() -> Iterator[None]:
     """Return to the present folder after code that may change it, so that names of files keep their meaning."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):
-            folder = Path.cwd()
-            stack.callback(_return_to, folder)
+    folder = None
+    with contextlib.suppress(OSError):
+        folder = Path.cwd()
+    try:
         yield
-
-
-def _return_to(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # It is deleted, or this user must not enter it.
-        os.chdir(folder)
+    finally:
+        with contextlib.suppress(OSError):  # It is deleted, or this user must not enter it.
+            os.chdir(folder or ".")
 
 
 def make_importable(folder: Path) -> None:

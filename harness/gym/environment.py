@@ -115,13 +115,6 @@ def check_options(options: object) -> None:
         raise ConfigurationError(f"reset has no options, got {options!r}; make another environment for another choice")
 
 
-def with_length(made: EnvSpec | None, periods: int) -> EnvSpec | None:
-    """Return a specification of Gymnasium that tells the length of an episode, a number of periods."""
-    if made is None:
-        return None
-    return replace(made, max_episode_steps=periods)
-
-
 def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
     """Return the same run with another seed, and so another robot, target and noise."""
     return replace(resolved, request=replace(resolved.request, seed=seed))
@@ -198,7 +191,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
     @spec.setter
     def spec(self, made: EnvSpec | None) -> None:
-        self._spec = with_length(made, self.periods)
+        self._spec = made
+        if made is not None:
+            self._spec = replace(made, max_episode_steps=self.periods)
 
     @property
     def observation(self) -> Observation | None:

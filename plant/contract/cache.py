@@ -35,7 +35,7 @@ BUILT: Final = "fmus"  # kind of FMUs that were built here
 CODE: Final = (EXTRACTED, BUILT)  # kinds whose files are loaded as code
 PRIVATE: Final = 0o700  # mode of a folder that is for its owner only
 NOT_ALLOWED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)  # errors of a folder that this user may not write
-PLAIN: Final = re.compile(r"[\w.~/-]*", re.ASCII)  # a path that reads the same in a URI
+PLAIN: Final = re.compile(r"[\w.~/-]*", re.ASCII)  # a path that reads the same in a URI, which an FMU gets
 LOCK_TIME: Final = 10.0  # [s] for another process to move its entry
 LOCK_PAUSE: Final = 0.01  # [s] between two tries
 LOCK_FLAGS: Final = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK  # also for a pipe, and the file of another user
@@ -91,7 +91,7 @@ def _folders(kind: str) -> list[Path]:
         if root is not None and (may_be_shared or _is_private(root / kind)):
             folders.append(root / kind)
     if kind in CODE:
-        folders.sort(key=_hinders_code)
+        folders.sort(key=lambda folder: forbids_code(folder) or PLAIN.fullmatch(str(folder)) is None)
     if not folders:
         raise ValueError(
             f"other users could write code into the cache folders {user} and {temporary}; let XDG_CACHE_HOME name a "
@@ -140,11 +140,6 @@ def _is_private(folder: Path) -> bool:
         if found.st_mode & writers and not kept_apart:
             return False
     return True
-
-
-def _hinders_code(folder: Path) -> bool:
-    """Return whether libraries cannot be loaded from a folder, or an FMU might misread the URI of its resources."""
-    return forbids_code(folder) or PLAIN.fullmatch(str(folder)) is None
 
 
 def forbids_code(folder: Path) -> bool:

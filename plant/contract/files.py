@@ -27,7 +27,7 @@ MAX_KEY_PARTS: Final = 32
 TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
 MAX_TOML: Final = 500_000  # [letters] beside texts and comments
 AROUND_FILE: Final = re.compile("[=:]")  # marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
-MAX_COMMAS: Final = 16  # that a path in a comma-separated list may have
+MAX_MARKS: Final = 16  # that a path in a list may have
 TIME: Final = "time_s"  # column of a table
 TIME_KINDS: Final = ("m", "M")  # numpy's kinds of durations and dates
 SECONDS: Final = f"for a column {TIME} in s, take (times - times[0]).total_seconds(), of a column by .dt"
@@ -286,23 +286,24 @@ def divisions(text: str, mark: str) -> list[tuple[str, str]]:
 
 def split_words(text: str, known: Container[str] = ()) -> tuple[str, ...]:
     """Split a comma-separated list, in which a known name and a file that exists may have commas themselves."""
-    parts = text.split(",")
-    words = []
+    return tuple(filter(None, words_between(text, ",", known)))
+
+
+def words_between(text: str, mark: str, known: Container[str] = ()) -> Iterator[str]:
+    """Yield the words between marks, also empty ones; a known name and a file that exists may have marks themselves.
+
+    The path of the file may stand between other parts of a word, but has all of its marks.
+    """
+    parts = text.split(mark)
     while parts:
-        for size in range(min(len(parts), MAX_COMMAS + 1), 0, -1):
-            word = ",".join(parts[:size]).strip()
-            if size == 1 or word in known or _names_file(word, size - 1):
+        for size in range(min(len(parts), MAX_MARKS + 1), 0, -1):
+            word = mark.join(parts[:size]).strip()
+            pieces = (word, word.partition("=")[2], *AROUND_FILE.split(word))
+            whole = [piece for piece in pieces if piece.count(mark) == size - 1]
+            if size == 1 or word in known or any(map(is_file, whole)):
                 break
         del parts[:size]
-        if word:
-            words.append(word)
-    return tuple(words)
-
-
-def _names_file(word: str, commas: int) -> bool:
-    """Return whether a word has the path of a file with all of its commas, alone or between other parts of the word."""
-    parts = [word, *AROUND_FILE.split(word)]
-    return any(part.count(",") == commas and is_file(part) for part in parts)
+        yield word
 
 
 def partial_path(path: Path) -> Path:

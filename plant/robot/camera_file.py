@@ -22,13 +22,8 @@ from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Number, Positive, Usual, nested, override, remark, settings
 from servobench.plant.robot.camera import PinholeCamera
-from servobench.plant.robot.camera_formats import in_rows, plain_name, read_intrinsics
+from servobench.plant.robot.camera_formats import LENSES, in_rows, plain_name, read_intrinsics
 
-LENSES: Final[Mapping[str, tuple[str, ...]]] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "equidistant": ("k1", "k2", "k3", "k4"),
-}
 SYNONYMS: Final[Mapping[str, str]] = {  # names without capitals, blanks, hyphens and underscores -> that of ROS
     **dict.fromkeys(("plumbbob", "radtan", "radialtangential", "brown", "brownconrady"), "plumb_bob"),
     **dict.fromkeys(("rationalpolynomial", "rational", "rationalmodel", "fullopencv"), "rational_polynomial"),

@@ -28,8 +28,11 @@ SIZES: Final = ("ImageSize", "image_size", "resolution")  # width and height
 PROJECTIONS: Final = ("camera_model", "model_type", "Camera.type")
 PINHOLES: Final = ("pinhole", "pinholefull", "perspective", "opencv")  # projections with any distortion
 FOCAL_NAMES: Final = (("fx", "fy", "cx", "cy"), ("fl_x", "fl_y", "cx", "cy"), ("mu", "mv", "u0", "v0"))
-COEFFICIENTS: Final[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-FISHEYE: Final[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+LENSES: Final[Mapping[str, tuple[str, ...]]] = {  # ROS's name of a model -> coefficients of OpenCV, in its order
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
 FISHEYE_OF_VINS: Final = ("k2", "k3", "k4", "k5")
 PARTS: Final = ("projection_parameters", "distortion_parameters")  # sections of VINS
 # In names of keys, or whole names.
@@ -62,9 +65,9 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     projection = next((str(found[name]) for name in PROJECTIONS if name in found), "")
     if projection and "matrix" not in keys:
         raise ValueError(f"{path.name} is of the projection {projection!r}, which is not known or lacks its numbers")
-    if any(name not in keys for name in ("width", "height", "matrix")):
-        lacking = next(name for name in ("width", "height", "matrix") if name not in keys)
-        raise ValueError(f"{path.name} has no {NAMES[lacking][0]}")
+    for name in ("width", "height", "matrix"):
+        if name not in keys:
+            raise ValueError(f"{path.name} has no {NAMES[name][0]}")
     if "distortion" not in keys and (other := _distortions(found)):
         raise ValueError(f"{path.name} has {other[0]!r}; wanted the name distortion_coefficients")
     if "distortion_model" in keys:
@@ -134,9 +137,9 @@ def _flat(found: dict[Any, Any]) -> dict[str, Any]:
     if isinstance(numbers, list) and len(numbers) == 4:
         fx, fy, cx, cy = numbers
         keys.setdefault("camera_matrix", [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
-    given = {name: keys[name] for name in COEFFICIENTS if name in keys}
+    given = {name: keys[name] for name in LENSES["rational_polynomial"] if name in keys}
     if "mu" in keys:
-        given = {name: keys.get(other, 0.0) for name, other in zip(FISHEYE, FISHEYE_OF_VINS, strict=True)}
+        given = {name: keys.get(other, 0.0) for name, other in zip(LENSES["equidistant"], FISHEYE_OF_VINS, strict=True)}
     if given and not any(name in keys for name in NAMES["distortion"]):
         keys["distortion_coefficients"] = given
     return keys

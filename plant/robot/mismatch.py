@@ -30,7 +30,7 @@ from typing import Final, Self
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.files import is_file
+from servobench.plant.contract.files import words_between
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import ANGLE, LENGTH, SENSOR_AXES, SHARE, sensor_settings
 from servobench.plant.contract.settings import likely_meant, nearest, remark, suggest
@@ -42,16 +42,6 @@ from servobench.plant.robot.robot import Robot
 MAX_TILT = radians(45.0)
 MAX_MOVE_TILT = radians(30.0)
 MAX_MAGNITUDES = 10_000  # largest number of magnitudes in a range
-
-
-def _split_words(text: str) -> list[str]:
-    """Return the words between plus signs; the path of a calibration that exists is taken as it stands."""
-    words = [word.strip() for word in text.split("+")]
-    for size in range(len(words), 1, -1):
-        first = "+".join(words[:size])
-        if first.startswith("factory=") and is_file(first.removeprefix("factory=")):
-            return [first, *words[size:]]
-    return words
 
 
 def _unknown_word(text: str, word: str) -> ValueError:
@@ -111,7 +101,7 @@ class Mismatch:
             ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
         """
         profile, calibration, axes = "", None, []
-        for position, word in enumerate(_split_words(text)):
+        for position, word in enumerate(words_between(text, "+")):
             name, equals, value = word.partition("=")
             if name in PROFILES and position == 0 and (name == "factory" or not equals):
                 profile, calibration = name, value if equals else None
