@@ -17,11 +17,12 @@ from servobench.harness.run.resolution import ResolvedRun, resolve, resolve_sect
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import TIME, numbers_of, read_table
-from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.settings import remark, suggest
 from servobench.plant.robot.mismatch import Mismatch
 
 TABLES: Final = (".csv", ".parquet")  # suffixes
 MAX_PERIOD: Final = 2.0  # [s] between rows of a log
+USUAL_PERIODS: Final = (9e-4, 0.9)  # [s] likewise
 FIT_MARGIN: Final = 1.5  # [1] times the tolerance, as the fitted steps of a short log are off themselves
 PER_SECOND: Final = {"ms": 1e3, "µs": 1e6, "ns": 1e9}  # counts of a clock
 TIME_TOLERANCE: Final = 1e-3  # [s] by which logged instants may be off, as of stamps in whole ms
@@ -142,7 +143,10 @@ def _period(path: Path, table: pd.DataFrame) -> float:
         units = [f"{unit}: divide it by {count:g}" for unit, count in PER_SECOND.items() if 1e-3 <= usual / count < 1.0]
         needed = f"it needs two or more, and time_s in s, not in {next(iter(units), 'ms')}"
         raise ConfigurationError(f"log {path} has {len(times)} rows, {usual:g} s apart; {needed}")
-    mean, tolerance = float(np.mean(steps)), min(TIME_TOLERANCE, usual / 8.0)
+    if not USUAL_PERIODS[0] < usual < USUAL_PERIODS[1]:
+        remark(f"rows of {path.name} are {usual:.3g} s apart: time_s is in s, no count of rows or minutes")
+    mean = float(np.mean(steps))
+    tolerance = min(TIME_TOLERANCE, usual / 8.0)
     late = np.abs(times - times[0] - mean * np.arange(len(times))) > tolerance
     rounding = 0.1 * tolerance
     if late.any() or (np.abs(steps - usual) > 2.0 * tolerance).any():

@@ -24,7 +24,7 @@ from servobench.harness.run.request import DEFAULT_ROBOT, SHORT_NAMES, RunReques
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.faults import ConfigurationError, configuration_errors
 from servobench.plant.contract.files import parse_toml, split_words
-from servobench.plant.contract.settings import listed
+from servobench.plant.contract.settings import listed, remark
 from servobench.plant.contract.units import UNITS, in_own_unit, split_quantity
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes, parse_range
 
@@ -56,6 +56,7 @@ class Batch:
 
         def run(sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
             if plant in own:
+                remark(f"plant {plant} has a robot of its own: the mismatch moderate stands for none there")
                 mismatch = Mismatch()
             return RunRequest(plant, controller, task, mismatch, seed, robot=self.robot, sensing=sensing)
 

@@ -175,7 +175,8 @@ def sensor(log: Log, robot: Identified) -> Sensor:
     if swing > MIN_LATE:
         sensing |= {"latency_swing": swing, "swing_period": robot.swing_period}
         waiting = arrivals(log.spec.period, 0.0, swing, robot.swing_period)
-        sensing["latency_swing"] *= swing / waiting.swing
+        if waiting.swing > MIN_LATE:
+            sensing["latency_swing"] *= swing / waiting.swing
     elif spread > MIN_LATE:
         tried = [(arrivals(log.spec.period, jitter), jitter) for jitter in JITTERS]
         waiting, sensing["jitter"] = min(tried, key=lambda each: abs(each[0].deviation - spread))

@@ -423,6 +423,8 @@ def build_bench(
     except ValueError as error:
         if step == setup.period:
             raise
-        raise ValueError(f"in sub-steps of {step:g} s, which the delays and the period need: {error}") from error
+        found = f"in sub-steps of {step:g} s, which the delays and the period need: {error}"
+        remedy = "run.period, command_delay and latency that are multiples of its own step help"
+        raise ValueError(f"{found}; {remedy}") from error
     command_delay, sensing = rounded_to(step, setup.period, command_delay, sensing)
     return Bench(world, command_delay, sensing, setup.period, None if setup.model is None else setup.model.camera)

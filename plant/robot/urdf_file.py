@@ -54,7 +54,7 @@ def read_urdf_robot(path: Path, tip: str) -> Robot:
         try:
             workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
         except ValueError as error:
-            raise ValueError("; ".join(filter(None, (str(error), chain.ending)))) from error
+            raise ValueError(f"{error}; {chain.ending}".removesuffix("; ")) from error
     flaw = ""
     if flaws:
         flaw = flaws[0]

@@ -266,6 +266,7 @@ def test_settings_of_a_user_and_plants_with_a_model_stay_as_they_are(tmp_path, c
     assert "has no model" not in caplog.text
     batch = Batch((plant, "kinematic"), ("ukf_mfac",), ("target",), ("moderate",), (0,))
     assert [str(request.mismatch) for request in batch.requests()] == ["none", "moderate"]
+    assert "stub.toml has a robot of its own: the mismatch moderate stands for none there" in caplog.text
 
 
 class Calls(Controller):

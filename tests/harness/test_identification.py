@@ -372,6 +372,13 @@ def test_a_twin_has_the_features_and_the_uncertainty_of_the_log(tmp_path):
     assert 1e-5 < np.std(drawn, axis=0).mean() < 1e-3
 
 
+def test_a_swing_of_the_latency_that_the_bench_would_not_show_stays_as_it_is():
+    log = logged()[0]
+    swing = np.array(identified().names) == "swing_sin"
+    found = replace(identified(), values=np.where(swing, 3.0, identified().values), swing_period=log.spec.period)
+    assert sensor(log, found).settings["sensing"]["latency_swing"] == pytest.approx(3.0, abs=0.01)
+
+
 def test_a_latency_that_is_estimated_below_0_is_0_in_a_twin(tmp_path):
     found, path = identified(), tmp_path / "twin.toml"
     values = found.values.copy()

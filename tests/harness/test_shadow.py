@@ -10,7 +10,7 @@ import pytest
 from kit.broken_controllers import stepping
 from kit.command import servobench
 from servobench import compare, run
-from servobench.harness.batch.logs import logged_in_file, logged_in_folder
+from servobench.harness.batch.logs import _period, logged_in_file, logged_in_folder
 from servobench.harness.batch.results import read_manifest, write_manifest
 from servobench.harness.config.registry import choose_controller
 from servobench.harness.config.settings import flatten
@@ -331,3 +331,11 @@ def test_features_are_predicted_over_lost_frames_from_the_last_valid_one(steps, 
     ahead = scores(table, tmp_path, 1.0)[0]["predicted_feature_x_m"]
     assert ahead.first_valid_index() == 1
     assert np.isnan(ahead[50])
+
+
+@pytest.mark.parametrize(("unit", "told"), [(1.0, ""), (1.0 / 60.0, "0.000833 s apart"), (20.0, "1 s apart")])
+def test_stamps_in_minutes_or_counts_of_rows_are_remarked_on(tmp_path, caplog, unit, told):
+    remark.cache_clear()
+    _period(tmp_path / "log.csv", pd.DataFrame({"time_s": unit * 0.05 * np.arange(100)}))
+    assert told in caplog.text
+    assert bool(told) == ("time_s is in s, no count of rows or minutes" in caplog.text)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from kit.plants import NEEDS_BULLET, configure, setup
+from servobench.harness.analysis.loops.equilibrium import TIME_DIGITS
 from servobench.harness.config.registry import find_plant
-from servobench.plant.bench.bench import Bench, common_step
+from servobench.plant.bench.bench import Bench, build_bench, common_step
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import remark
 from servobench.plant.contract.signals import Command
@@ -196,3 +197,18 @@ def test_a_bench_refuses_a_world_that_is_too_coarse():
     world = KinematicWorld(KinematicConfig(), setup(period=0.05))
     with pytest.raises(ValueError, match=r"latency must be a multiple of the world's period of 0\.05 s, got 0\.02 s"):
         Bench(world, 0.05, SensingConfig(latency=0.02))
+
+
+@pytest.mark.parametrize("periods", [1, 7, 88])
+def test_latencies_that_an_analysis_tries_need_no_fine_sub_steps(periods):
+    sensing = SensingConfig(latency=round(0.05 + periods / 30.0, TIME_DIGITS))
+    assert common_step(1.0 / 30.0, 0.05, sensing) == pytest.approx(1.0 / 60.0)
+
+
+def test_an_own_step_that_fits_no_sub_step_is_refused_with_a_remedy():
+    def refuse(_):
+        raise ValueError("its step is 0.01 s")
+
+    said = r"sub-steps of 0.0166667 s.*0.01 s; run.period, command_delay and latency that are multiples of its own step"
+    with pytest.raises(ValueError, match=said):
+        build_bench(refuse, setup("none", 1.0 / 30.0), 0.05, SensingConfig())
