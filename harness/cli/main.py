@@ -217,7 +217,9 @@ def _line_for_user(error: ValueError | ImportError | RecursionError | MemoryErro
     if isinstance(error, RecursionError) and "--debug" not in sys.argv:
         return "the input is nested too deeply"
     if isinstance(error, MemoryError) and "--debug" not in sys.argv:
-        return f"the memory is not enough: {error or 'no more is free'}; make the work smaller, or use fewer workers"
+        return (
+            f"the memory is not enough: {str(error) or 'no more is free'}; make the work smaller, or use fewer workers"
+        )
     return str(error) if isinstance(error, ConfigurationError) else None
 
 

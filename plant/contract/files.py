@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Final
@@ -26,6 +26,7 @@ TOML_TEXT: Final = re.compile(  # a text of any of four kinds, or a comment
 MAX_KEY_PARTS: Final = 32
 TOML_LONG_KEY: Final = re.compile(rf"""(?<![\w"-])(?:[\w"-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS},}}""")
 MAX_TOML: Final = 500_000  # [letters] beside texts and comments
+MAX_KEY: Final = 10_000  # [letters]
 AROUND_FILE: Final = re.compile("[=:]")  # marks between a path and other parts of a word: NAME=PATH:CLASS, fmu:PATH
 MAX_MARKS: Final = 16  # that a path in a list may have
 TIME: Final = "time_s"  # column of a table
@@ -147,10 +148,11 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 def parse_toml(text: str) -> dict[str, Any]:
     """Return the content of a text in TOML.
 
-    Time and memory of the parser grow with the square of the parts of a key, and each part has tables of its own.
+    Time and memory of the parser grow with the square of the parts of a key, and each part has tables of its own. A
+    long key in quotes costs those who look for a similar one.
 
     Raises:
-        ValueError: it is not valid, or of keys with too many parts, or of too many.
+        ValueError: it is not valid, or of keys that are too long, have too many parts, or are too many.
     """
     import tomllib  # noqa: PLC0415 - help pages are printed without it
 
@@ -159,7 +161,23 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError(f"the key {long[0][:20]}… has more than {MAX_KEY_PARTS} parts; nest no deeper")
     if len(bare) > MAX_TOML:
         raise ValueError(f"it has {len(bare)} letters beside texts and comments; at most {MAX_TOML} are read")
-    return tomllib.loads(text)
+    content = tomllib.loads(text)
+    _refuse_long_keys(content)
+    return content
+
+
+def _refuse_long_keys(content: object) -> None:
+    """Raise a `ValueError` for a key of too many letters in a table or list, or in those within."""
+    within = content
+    if isinstance(content, dict):
+        for key in content:
+            if len(key) > MAX_KEY:
+                raise ValueError(f"the key {key[:20]}… has {len(key)} letters; at most {MAX_KEY} are read")
+        within = content.values()
+    if isinstance(within, (str, bytes)) or not isinstance(within, Iterable):
+        return
+    for part in within:
+        _refuse_long_keys(part)
 
 
 def read_text(kind: str, path: Path) -> str:

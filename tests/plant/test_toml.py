@@ -5,7 +5,7 @@ import time
 import pytest
 
 from servobench.plant.contract.faults import ConfigurationError
-from servobench.plant.contract.files import MAX_KEY_PARTS, parse_toml, read_toml
+from servobench.plant.contract.files import MAX_KEY, MAX_KEY_PARTS, parse_toml, read_toml
 
 MANY = 100_000
 PARTS = ["a"] * MANY
@@ -43,6 +43,15 @@ def test_a_key_of_many_parts_is_refused_at_once(kind, tmp_path):
 def test_many_short_lines_are_refused_at_once(line):
     with pytest.raises(ValueError, match="letters beside texts and comments; at most 500000 are read"):
         parse_toml("\n".join(map(line.format, range(MANY))))
+
+
+@pytest.mark.parametrize("where", ['"{}" = 1', "'{}'.b = 1", '["{}"]', 'a = [{{b = {{"{}" = 1}}}}]'])
+def test_a_long_key_in_quotes_is_refused(where):
+    parse_toml(where.format("k" * MAX_KEY))
+    with pytest.raises(
+        ValueError, match=f"the key kkkkkkkkkkkkkkkkkkkk… has {MAX_KEY + 1} letters; at most {MAX_KEY} are"
+    ):
+        parse_toml(where.format("k" * (MAX_KEY + 1)))
 
 
 @pytest.mark.parametrize("nested", ["[" * MANY + "]" * MANY, "{b=" * MANY + "1" + "}" * MANY])
