@@ -54,7 +54,7 @@ from servobench.plant.robot.hand_eye import FEATURE
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
-PART, OTHER_PART = "parts/00000000.runs.parquet", "parts/00000001.runs.parquet"
+PART = "parts/00000000.runs.parquet"
 RUN = RunRequest("kinematic", "rbfnn_mfac", "target", Mismatch(), 0)
 
 
@@ -377,9 +377,7 @@ RESULTS: dict[str, Parser] = {
     "checksums": Parser(of_runs("SHA256SUMS"), (files()["SHA256SUMS"].decode(),), ("  ", "\n", "parts/", "../"), 0.05),
     "table of runs": Parser(of_runs("runs.parquet"), (files()["runs.parquet"],), TABLE_WORDS, 0.09),
     "table of steps": Parser(of_runs("steps.parquet"), (files()["steps.parquet"],), TABLE_WORDS, 0.05),
-    "part": Parser(
-        of_runs(PART, parts=True), tuple(files(parts=True)[name] for name in (PART, OTHER_PART)), TABLE_WORDS, 0.09
-    ),
+    "part": Parser(of_runs(PART, parts=True), (files(parts=True)[PART],), TABLE_WORDS, 0.09),
     "part name": Parser(part_name, ("00000000.runs.parquet",), (".", "x", ".runs.parquet", *NUMBERS[:6]), 0.02),
     "other table": Parser(other_table, ("a,b\n1,2\n",), (",", "\n", '"', "\0", *NUMBERS), 0.3),
     "lock": Parser(lock, (HOLDER,), (*JSON_WORDS, *NUMBERS), 1),

@@ -223,7 +223,8 @@ def problems_of(target: Path, name: str, old: bytes, new: bytes) -> tuple[str, .
     with zipfile.ZipFile(target, "w") as archive:
         for entry, content in contents.items():
             archive.writestr(entry, content)
-    return validate_fmu(target).problems
+    found = validate_fmu(target)
+    return (*found.problems, *found.departures)
 
 
 def test_validation_tells_what_is_wrong(tmp_path):
