@@ -178,7 +178,6 @@ def test_fixed_parameters_reach_the_model_like_tunable_ones(tmp_path):
         ),
         ("calibrated", 'derivative="1"', "", "crane.fmu cannot be read by CasADi: Error processing derivative"),
         ("calibrated", 'modelIdentifier="crane" p', 'modelIdentifier="boat" p', "crane.fmu cannot be read by CasADi"),
-        ("constant", "<ModelExchange", "<ModelExchange", "source 'nominal' needs a nominal model"),
     ],
 )
 def test_where_the_fmu_cannot_tell_it_is_one_clear_line(tmp_path, controller, old, new, message):
