@@ -17,6 +17,8 @@ from rich.console import Console
 from servobench.plant.contract.files import harmless
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     import pandas as pd
 
 FAILED = 1  # exit code where a run failed, a check was not passed or answers are different
@@ -60,9 +62,12 @@ def ending_alike() -> Iterator[list[int]]:
     dropped: list[object] = []
     hook = sys.unraisablehook
 
-    def interrupt(number: int, _frame: object) -> NoReturn:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         caught.append(number)
-        raise KeyboardInterrupt
+        handler = signal.getsignal(signal.SIGINT)  # That of asyncio, while its loop runs, raises nothing amid a task.
+        if not callable(handler):
+            raise KeyboardInterrupt
+        handler(signal.SIGINT, frame)
 
     def report(unraisable: sys.UnraisableHookArgs) -> None:
         if unraisable.exc_type is not KeyboardInterrupt:

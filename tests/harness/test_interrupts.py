@@ -1,5 +1,6 @@
 """Signals end a command as Ctrl-C does, wherever they meet it, and its temporary files with it."""
 
+import asyncio
 import os
 import signal
 import sys
@@ -72,3 +73,22 @@ def test_a_command_that_is_terminated_leaves_no_temporary_file_and_nothing_that_
     assert output.splitlines()[-1] in ("servobench: terminated", "servobench: interrupted")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["folder", "temporary"]
     assert not any((tmp_path / "temporary").iterdir())
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_amid_a_connection_ends_a_server_without_a_trace(name, caplog):
+    async def answer(_reader, writer):
+        signal.raise_signal(signal.Signals[name])
+        writer.close()
+
+    async def serve():
+        async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+            _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+            try:
+                await asyncio.sleep(60.0)
+            finally:
+                writer.close()
+
+    with pytest.raises(KeyboardInterrupt), ending_alike():
+        asyncio.run(serve())
+    assert not caplog.records
