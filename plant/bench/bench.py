@@ -47,7 +47,7 @@ class Timing:
     delays: tuple[int, ...]  # [periods] age of the command that acts in each of the N sub-steps of a period
     latency: int  # between exposure and delivery of a frame
     frames: float  # between two exposures; a fraction where frames take no whole number of sub-steps
-    phase: int  # of the exposures, which happen after the sub-steps nearest to `phase` + j `frames`, j whole
+    phase: int  # exposures happen after the sub-steps nearest to `phase` + j `frames`, j whole
 
     @classmethod
     def of(cls, period: float, step: float, command_delay: float, sensing: SensingConfig) -> Self:

@@ -64,7 +64,7 @@ OF_OTHERS: Final = (
     "sensor",
 )  # parts of a robot for other programs
 OF_XACRO: Final = ("property", "macro", "include", "insert_block", "if", "unless", "arg")  # elements without a prefix
-EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # of xacro
+EXPRESSION: Final = re.compile(r"\$[{(].*?[})]")  # xacro would replace it
 DYNAMIC: Final = re.compile(
     r"effort|torque|current|velocity|accel|decel|jerk|damp|frict|stiff"
 )  # in names of limits without geometry
