@@ -21,7 +21,7 @@ from servobench.plant.cameras.setups import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.bullet import BulletScene
-from servobench.plant.rendered.detectors import begin_noise, open_detector
+from servobench.plant.rendered.detectors import ImageNoise, open_detector
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
@@ -46,7 +46,7 @@ def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, f
     model, rng = true_model(word, seed), np.random.default_rng(seed)
     scene = BulletScene(Room(model.arm, NOISELESS.scenery, robot=ROBOT, model=model))
     detector, work, took = open_detector(model, scene, NOISELESS, ROBOT), ROBOT.workspace, 0.0
-    noise = begin_noise(seed)
+    noise = ImageNoise(seed)
     true, found = [], []
     while len(true) < poses:
         q = rng.uniform(work.lower, work.upper)
@@ -56,6 +56,7 @@ def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, f
         scene.place(model.arm.joint_angle(q))
         began = time.process_time()
         seen, valid = detector.measure(model, q, noise)
+        noise = noise.next()
         took += time.process_time() - began
         true.append(exact)
         found.append(np.where(valid, seen, np.nan))

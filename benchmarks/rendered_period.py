@@ -1,10 +1,9 @@
 """Cost of a period of the rendered plants over the render and physics calls that it needs.
 
 All calls of an engine are measured in the same run, in turns, with and without table and floor: the bare calls of the
-engine, which are its physics, contact and one image of the same camera, and a whole `Bench.step`. For `bullet` a loop
-as environments of Gymnasium are often written is beside them, with a call for each motor, all outputs of the renderer
-and the mean of the red points as the feature; for `mujoco` an image of the ball's window alone, which the plant takes,
-and the two largest parts of a step.
+engine, which are its physics, contact and one image of the ball's window, and a whole `Bench.step`. For `bullet` a loop
+as environments of Gymnasium are often written is beside them, with a call for each motor, all outputs of the renderer,
+which draws the whole image, and the mean of the red points as the feature.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from measuring import asked_to_be_quick, table, times_in_turns
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.detection import whole
+from servobench.plant.rendered.detection import Window, window_around
 from servobench.plant.rendered.drives import PHYSICS_STEP
-from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.engine import Machine, Scene
 from servobench.plant.rendered.plants import BULLET, MUJOCO
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
@@ -36,6 +35,13 @@ HOME, MODEL = np.array(ur5.HOME), ROBOT.nominal
 PERIOD = 0.05  # [s]
 STEPS = whole_steps(PERIOD, PHYSICS_STEP)
 Calls = dict[str, Callable[[FloatArray], object]]  # of joint velocities [rad/s], by name; the bare calls first
+
+
+def window_of_ball(scene: Scene) -> Window:
+    """Return the window of the image around the ball of a scene."""
+    window = window_around(MODEL.to_camera(scene.ball_position()), ROBOT.workspace.ball_radius, CAMERA)
+    assert window is not None, "the ball at HOME is in the image"
+    return window
 
 
 def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
@@ -53,6 +59,7 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     plant.reset(0)
     for scene in scenes:
         scene.place(HOME)
+    window = window_of_ball(scenes[0])
     plain, plain_arm = scenes[1]._world.client, scenes[1]._arm
     pybullet.setPhysicsEngineParameter(fixedTimeStep=PHYSICS_STEP, physicsClientId=plain)
     matrices = [each.T.ravel().tolist() for each in (view_matrix(MODEL.X_BC), camera.projection_matrix())]
@@ -65,7 +72,7 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
                 pybullet.calculateInverseDynamics(arm, theta, rest, rest, physicsClientId=client)
             if step % CONTACT_STEPS == 0:
                 list(mechanics.overlaps(HOME))
-        scenes[0].render(camera, MODEL.X_BC)
+        scenes[0].render(camera, MODEL.X_BC, window)
 
     def environment(action: FloatArray) -> tuple[FloatArray, FloatArray]:
         for _ in range(STEPS):
@@ -93,7 +100,7 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
 
 
 def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
-    """Return the calls of MuJoCo, with the whole image and with the ball's window, and those of the plant."""
+    """Return the calls of MuJoCo and of the plant."""
     from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation, mujoco
 
     plant = opened.enter_context(closing(MUJOCO.build(config, PlantSetup(MODEL, HOME, PERIOD))))
@@ -104,6 +111,7 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     scene = opened.enter_context(closing(MujocoScene(Room(MODEL.arm, config.scenery, ROBOT))))
     simulation.start(HOME)
     scene.place(HOME)
+    window = window_of_ball(scene)
 
     def bare() -> None:
         model, data = simulation._model, simulation._data
@@ -117,7 +125,7 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
                 mujoco.mj_kinematics(shapes, placed)
                 mujoco.mj_comPos(shapes, placed)
                 mujoco.mj_collision(shapes, placed)
-        scene.draw(CAMERA, MODEL.X_BC, whole(CAMERA))
+        scene.draw(CAMERA, MODEL.X_BC, window)
 
     return {"bare calls": lambda _: bare(), "`Bench.step`": lambda speed: plant.step(Command(speed))}
 

@@ -308,15 +308,15 @@ class SetupModel(RobotModel):
 
     def feature_at(self, points: FloatArray) -> FloatArray:
         """Return the features, (..., m), of a target at `points` (..., p, 3) m in the frame of the cameras' mount."""
-        return self.setup.measure(self._in_cameras(points), self.optics)
+        return self.setup.measure(self.in_cameras(points), self.optics)
 
     def valid_at(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features of such a target are valid, (..., m), within a share of the images' half sides."""
-        return self._valid(self._in_cameras(points), share)
+        return self._valid(self.in_cameras(points), share)
 
     def incidence(self, points: FloatArray) -> FloatArray:
         """Return the cosine of the angle between a plate's normal and the first camera's ray, (...); 1 for a point."""
-        return _incidence(self._in_cameras(points)[..., 0, :, :])
+        return _incidence(self.in_cameras(points)[..., 0, :, :])
 
     def valid(self, joint_position: npt.ArrayLike) -> BoolArray | None:
         """Return which features can be measured, (..., m)."""
@@ -344,7 +344,7 @@ class SetupModel(RobotModel):
         motions = self.arm.motions(frames, at)
         if self.mount == "hand":
             motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
-        points = self._in_cameras(self._mounted(flange, at))
+        points = self.in_cameras(self._mounted(flange, at))
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
         turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
         return points, np.swapaxes(turned, -1, -2)
@@ -366,7 +366,7 @@ class SetupModel(RobotModel):
             return at
         return np.asarray(np.vecmat(at - flange[..., None, :3, 3], flange[..., None, :3, :3]))
 
-    def _in_cameras(self, points: FloatArray) -> FloatArray:
+    def in_cameras(self, points: FloatArray) -> FloatArray:
         """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
         cameras = self.cameras[..., None, :, :]
         return np.asarray(np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3]))

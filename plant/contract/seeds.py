@@ -25,19 +25,24 @@ def check_seed(seed: int) -> None:
         raise ValueError(f"seed must be a non-negative integer, got {seed}")
 
 
-def named_sequence(seed: int, name: str) -> np.random.SeedSequence:
+def named_sequence(seed: int, name: str, *numbers: int) -> np.random.SeedSequence:
     """Return the seed sequence of the part called `name` below the run's `seed`.
+
+    Args:
+        seed: of the run.
+        name: of the part.
+        numbers: of a frame and a camera, say, each of which has a sequence of its own.
 
     Raises:
         ValueError: a negative seed.
     """
     check_seed(seed)
-    return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
+    return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()), *numbers))
 
 
-def named_generator(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of the part called `name` below the run's `seed`."""
-    return np.random.default_rng(named_sequence(seed, name))
+def named_generator(seed: int, name: str, *numbers: int) -> np.random.Generator:
+    """Return the random generator of a part; see `named_sequence`."""
+    return np.random.default_rng(named_sequence(seed, name, *numbers))
 
 
 def named_seed(seed: int, name: str) -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.detection import Window
+from servobench.plant.rendered.detection import Window, whole
 from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
 from servobench.plant.rendered.engine import MIN_OVERLAP, Engine, Image, Machine, Overlap, Scene, Simulation
 from servobench.plant.rendered.room import Room
@@ -147,24 +147,43 @@ class BulletScene(Scene):
         return np.array(state[4])
 
     def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
-        """See `Scene.render`; TinyRenderer knows no window, so that all is rendered."""
+        """See `Scene.render`; the projection is magnified so that the window fills the picture of TinyRenderer."""
+        window = window or whole(camera)
+        height, width = window.shape
+        projection = magnification(camera, window) @ camera.projection_matrix()
         _, _, rgba, depth, _ = pybullet.getCameraImage(
-            camera.width,
-            camera.height,
-            *(matrix.T.ravel().tolist() for matrix in (view_matrix(X_BC), camera.projection_matrix())),
+            width,
+            height,
+            view_matrix(X_BC).T.ravel().tolist(),
+            projection.T.ravel().tolist(),
             shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self._world.client,
         )
         # A PyBullet built without numpy returns tuples.
-        shape = (camera.height, camera.width)
-        rgba, depth = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
-        return (rgba, depth) if window is None else (window.cut(rgba), window.cut(depth))
+        colours = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)
+        return colours, np.asarray(depth).reshape(height, width)
 
     def close(self) -> None:
         """See `Scene.close`."""
         self._world.close()
+
+
+def magnification(camera: PinholeCamera, window: Window) -> FloatArray:
+    """Return the matrix, (4, 4), that scales and shifts clip coordinates so that a window fills the picture.
+
+    Clip coordinates x to the right and y upwards run from −1 to 1 over the whole image of w × h pixels:
+
+        x' = (w x + w − left − right) / (right − left),        y' = (h y − h + top + bottom) / (bottom − top)
+    """
+    matrix = np.eye(4)
+    height, width = window.shape
+    matrix[0, 0] = camera.width / width
+    matrix[1, 1] = camera.height / height
+    matrix[0, 3] = (camera.width - window.left - window.right) / width
+    matrix[1, 3] = (window.top + window.bottom - camera.height) / height
+    return matrix
 
 
 class BulletSimulation(Simulation):

@@ -11,7 +11,6 @@ where that slope grows without bound, and pixels whose residual stands far off t
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -25,7 +24,6 @@ from servobench.plant.robot.camera import IntArray, PinholeCamera
 ByteArray = npt.NDArray[np.uint8]
 HueRange: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]
 """Lowest and highest hue, saturation and brightness of a colour, as OpenCV has them."""
-COLOUR_MARGIN = 4  # [px] around all of a colour, in which colour noise can matter
 
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
@@ -44,7 +42,9 @@ MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
 RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
-MARGIN = COLOUR_MARGIN + 2  # [px] and two for the shift of an edge by rounding and by the sampling point of a pixel
+# [px] of a window around the target: four in which colour noise can matter, and two for the shift of an edge by
+# rounding and by the sampling point of a pixel.
+MARGIN = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,30 +101,18 @@ def largest_patch(mask: ByteArray) -> Patch | None:
     return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
 
 
-def add_colour_noise(
-    rgb: ByteArray, deviation: float, generator: np.random.Generator, colours: Iterable[HueRange] = (RED_RANGE,)
-) -> ByteArray:
-    """Return an image with white noise on each channel around all of each colour; nothing is drawn elsewhere.
-
-    Noise gives pixels of other things a colour by chance, but never as many together as the mark's, so only the boxes
-    around the pixels that have it without noise matter.
+def add_colour_noise(rgb: ByteArray, deviation: float, generator: np.random.Generator) -> ByteArray:
+    """Return an image with white noise on each channel of each pixel.
 
     Args:
-        rgb: (h, w, 3 or 4).
+        rgb: (h, w, 3 or 4), a window of an image; an opacity stays as it is.
         deviation: standard deviation of the noise, of 255.
-        generator: of the noise.
-        colours: around which there is noise; red by default.
+        generator: of the noise; three numbers are drawn for each pixel, whatever its colour.
     """
-    hsv, noisy = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), rgb.copy()
-    for colour in colours:
-        x, y, width, height = cv2.boundingRect(cv2.inRange(hsv, *colour))
-        if width * height < MIN_PIXELS:
-            continue
-        rows = slice(max(0, y - COLOUR_MARGIN), y + height + COLOUR_MARGIN)
-        columns = slice(max(0, x - COLOUR_MARGIN), x + width + COLOUR_MARGIN)
-        box = rgb[rows, columns, :3]
-        values = box + deviation * generator.standard_normal(box.shape)
-        noisy[rows, columns, :3] = np.clip(np.round(values), 0, 255).astype(np.uint8)
+    noisy = rgb.copy()
+    channels = rgb[..., :3]
+    values = channels + deviation * generator.standard_normal(channels.shape)
+    noisy[..., :3] = np.clip(np.round(values), 0, 255).astype(np.uint8)
     return noisy
 
 
@@ -270,6 +258,11 @@ class Window(NamedTuple):
         """Return the part of an image (h, w, ...) in this window, without a copy."""
         return image[self.top : self.bottom, self.left : self.right]
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width [px]."""
+        return self.bottom - self.top, self.right - self.left
+
 
 def whole(camera: PinholeCamera) -> Window:
     """Return the window of all pixels."""
@@ -306,3 +299,14 @@ def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> W
         min(camera.width, math.ceil(right) + 1 + MARGIN),
     )
     return window if window.top < window.bottom and window.left < window.right else None
+
+
+def window_around_all(centres: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
+    """Return the window outside of which no pixel shows any of the balls or discs, (p, 3) m; see `window_around`."""
+    windows = [window_around(centre, radius, camera) for centre in centres]
+    shown = np.array([window for window in windows if window is not None])
+    if len(shown) == 0:
+        return None
+    top, left = shown[:, :2].min(axis=0).tolist()
+    bottom, right = shown[:, 2:].max(axis=0).tolist()
+    return Window(top, left, bottom, right)

@@ -18,10 +18,10 @@ second moment and scaled back to unit variance.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, Generic, TypeAlias, TypeVar, final
+from typing import Any, Final, Generic, NamedTuple, Self, TypeVar, final
 
 import cv2
 import numpy as np
@@ -39,15 +39,18 @@ from servobench.plant.rendered.detection import (
     ByteArray,
     Detection,
     Patch,
+    Window,
     add_colour_noise,
     draw_detection,
     find_ball,
     find_patch,
     locate_ball,
     window_around,
+    window_around_all,
 )
 from servobench.plant.rendered.engine import Scene
-from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
+from servobench.plant.rendered.marks import MARK_COLOURS, Mark, disc_centre, find_marks, sphere_centre
+from servobench.plant.rendered.room import mark_radius
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import CAMERA, PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
@@ -59,13 +62,33 @@ CROSS: Final = 5  # [px] half size of the cross that marks a point in a picture
 DEPTH, COLOUR = "depth_noise", "colour_noise"  # names of the random streams
 
 Model = TypeVar("Model", bound=RobotModel)
-Generators: TypeAlias = Mapping[str, np.random.Generator]
-"""Random generators by the names of their streams."""
 
 
-def begin_noise(seed: int) -> Generators:
-    """Return the random streams of the noise of images at the start of a run."""
-    return {name: named_generator(seed, name) for name in (DEPTH, COLOUR)}
+@dataclass(frozen=True)
+class ImageNoise:
+    """The random streams of a frame's noise, one for the depths and one for the colours of each camera.
+
+    A stream gives numbers to all pixels of the window that is rendered, whatever is found in it. So a patch with one
+    pixel more has the same noise at all others, and so have the next frames.
+    """
+
+    seed: int  # seed of the run
+    frame: int = 0  # number of the frame since the reset
+
+    def next(self) -> Self:
+        """Return the streams of the next frame."""
+        return replace(self, frame=self.frame + 1)
+
+    def stream(self, name: str, camera: int) -> np.random.Generator:
+        """Return the stream called `DEPTH` or `COLOUR` of a camera, from its beginning."""
+        return named_generator(self.seed, name, self.frame, camera)
+
+
+class View(NamedTuple):
+    """The part of a camera's image in which a target appears."""
+
+    ideal: Window  # part of the ideal image, which is rendered
+    part: Window  # part of the camera's image, in which the lens shows it
 
 
 @final
@@ -94,10 +117,33 @@ class Lens:
         at = self._ideal.project(rays).astype(np.float32).reshape(planned.height, planned.width, 2)
         self._map = at[..., 0], at[..., 1]
 
-    def render(self, scene: Scene, X_BC: FloatArray) -> ByteArray:
-        """Return the image of the camera at X_BC (4, 4), (h, w, 3 or 4)."""
-        rgb, _ = scene.render(self._ideal, X_BC)
-        return rgb if self._map is None else np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_LINEAR))
+    def view(self, points: FloatArray, radius: float) -> View | None:
+        """Return the view of balls or discs; None where none appears.
+
+        Args:
+            points: (p, 3) [m], their centres in the camera frame.
+            radius: [m].
+        """
+        ideal = window_around_all(points, radius, self._ideal)
+        if ideal is None or self._map is None:
+            return None if ideal is None else View(ideal, ideal)
+        columns, rows = self._map
+        shown = (columns >= ideal.left) & (columns < ideal.right) & (rows >= ideal.top) & (rows < ideal.bottom)
+        left, top, width, height = cv2.boundingRect(shown.astype(np.uint8))
+        if width == 0:  # only the ideal image is wide enough to show them
+            return None
+        return View(ideal, Window(top, left, top + height, left + width))
+
+    def render(self, scene: Scene, X_BC: FloatArray, view: View | None = None) -> ByteArray:
+        """Return the image of the camera at X_BC (4, 4), or what a view shows of it, (h, w, 3 or 4)."""
+        rgb, _ = scene.render(self._ideal, X_BC, view and view.ideal)
+        if self._map is None:
+            return rgb
+        columns, rows = self._map
+        if view is not None:
+            columns = view.part.cut(columns) - view.ideal.left
+            rows = view.part.cut(rows) - view.ideal.top
+        return np.asarray(cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR))
 
 
 def as_planned(optics: Optics, planned: PinholeCamera) -> bool:
@@ -128,25 +174,26 @@ class DepthCamera:
         self._scene, self._config = scene, config
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def find(self, X_BC: FloatArray, ball: FloatArray, noise: Generators) -> Detection | None:
+    def find(self, X_BC: FloatArray, ball: FloatArray, noise: ImageNoise, number: int = 0) -> Detection | None:
         """Return the ball as found in an image of the camera, or None.
 
         Args:
             X_BC: (4, 4), the camera.
             ball: (3,) [m], its true place in the base frame: only the part of the image around it is rendered.
             noise: of depths and colours.
+            number: of the camera, each of which has noise of its own.
         """
         window = window_around(X_BC[:3, :3].T @ (ball - X_BC[:3, 3]), self.radius, self.camera)
         if window is None:
             return None
         rgba, buffer = self._scene.render(self.camera, X_BC, window)
         if self._deviation > 0.0:
-            rgba = add_colour_noise(rgba, self._deviation, noise[COLOUR])
+            rgba = add_colour_noise(rgba, self._deviation, noise.stream(COLOUR, number))
         patch = find_patch(rgba)
         if patch is None:
             return None
         depth = self.camera.metric_depth(buffer[patch.rows, patch.columns])
-        measured = measure_depth(self._config, depth, patch, self.camera, noise[DEPTH])
+        measured = measure_depth(self._config, depth, patch, window.shape, self.camera, noise.stream(DEPTH, number))
         # A patch touches the border of the window only where the image ends, too.
         patch = Patch(patch.rows + window.top, patch.columns + window.left)
         return locate_ball(patch, measured, self.camera, self.radius)
@@ -165,7 +212,7 @@ class Detector(ABC, Generic[Model]):
     """
 
     @abstractmethod
-    def measure(self, model: Model, q: FloatArray, noise: Generators) -> tuple[FloatArray | None, BoolArray | None]:
+    def measure(self, model: Model, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray | None, BoolArray | None]:
         """Return the features as measured with the noise of images, (m,), and which are valid, (m,).
 
         No features mean that nothing was found, no mask that all features are valid.
@@ -193,7 +240,7 @@ class BallDetector(Detector[HandEyeModel]):
         camera, ball_radius = CAMERA.reaching(robot.workspace.camera_distance), robot.workspace.ball_radius
         self._scene, self._camera = scene, DepthCamera(scene, config, camera, ball_radius)
 
-    def measure(self, model: HandEyeModel, q: FloatArray, noise: Generators) -> tuple[FloatArray | None, None]:
+    def measure(self, model: HandEyeModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray | None, None]:
         """Return the ball's centre as fitted to the depths, (3,) m, or None."""
         found = self._camera.find(model.X_BC, self._scene.ball_position(), noise)
         if found is None:
@@ -224,39 +271,48 @@ class BallDetector(Detector[HandEyeModel]):
 class MarkCameras:
     """Cameras without depth, in whose images marks are found."""
 
-    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig) -> None:
-        """Take a scene with the target of a set-up."""
+    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig, radius: float) -> None:
+        """Take a scene with the target of a set-up, whose ball or discs have a radius [m]."""
         self._scene, self._planned = scene, model.planned.reaching(model.distance)
         self._lenses = [Lens(self._planned, model.optics, camera) for camera in range(model.setup.cameras)]
+        self._radius = radius
         self._colours = MARK_COLOURS[: len(model.target)]
         self._centre = sphere_centre if len(model.target) == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
+    def find(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
         """Return the points in the frame of each camera, (c, p, 3) m at a depth of 1 m, and which are found, (c, p)."""
-        images, hues = self._images(model, q), [colour.hues for colour in self._colours]
-        if self._deviation > 0.0:
-            images = [add_colour_noise(image, self._deviation, noise[COLOUR], hues) for image in images]
-        found, pixels = self._find(images)
+        marks: list[Sequence[Mark | None]] = []
+        poses = camera_poses(model, q)
+        for number, at in enumerate(model.in_cameras(model.points(q))):
+            lens = self._lenses[number]
+            view = lens.view(at, self._radius)
+            if view is None:
+                marks.append([None] * len(self._colours))
+                continue
+            image = lens.render(self._scene, poses[number], view)
+            if self._deviation > 0.0:
+                image = add_colour_noise(image, self._deviation, noise.stream(COLOUR, number))
+            marks.append(find_marks(image, self._colours, (view.part.top, view.part.left)))
+        found, pixels = self._measure(marks)
         points = locate(pixels, np.ones(found.shape), model.optics)
         points[~found] = NOWHERE
         return points, found
 
     def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
         """Return the images of all cameras side by side, with a cross at each mark that is found, (h, w, 3)."""
-        images = [np.ascontiguousarray(image[..., :3]) for image in self._images(model, q)]
-        for image, found, pixels in zip(images, *self._find(images), strict=True):
+        images = []
+        for lens, pose in zip(self._lenses, camera_poses(model, q), strict=True):
+            image = lens.render(self._scene, pose)
+            images.append(np.ascontiguousarray(image[..., :3]))
+        measured = self._measure([find_marks(image, self._colours) for image in images])
+        for image, found, pixels in zip(images, *measured, strict=True):
             for u, v in pixels[found].round().astype(int).tolist():
                 cv2.drawMarker(image, (u, v), OUTLINE, cv2.MARKER_CROSS, 2 * CROSS)
         return np.concatenate(images, axis=1)
 
-    def _images(self, model: SetupModel, q: FloatArray) -> list[ByteArray]:
-        poses = camera_poses(model, q)
-        return [lens.render(self._scene, pose) for lens, pose in zip(self._lenses, poses, strict=True)]
-
-    def _find(self, images: list[ByteArray]) -> tuple[BoolArray, FloatArray]:
+    def _measure(self, marks: Sequence[Sequence[Mark | None]]) -> tuple[BoolArray, FloatArray]:
         """Return which marks are found, (c, p), and where, (c, p, 2) px; the middle of the image for the others."""
-        marks = [find_marks(image, self._colours) for image in images]
         middle = np.array([self._planned.width, self._planned.height]) / 2.0
         pixels = [[middle if mark is None else self._centre(mark, self._planned) for mark in row] for row in marks]
         return np.array([[mark is not None for mark in row] for row in marks]), np.array(pixels)
@@ -280,10 +336,11 @@ class BallCameras:
             raise ValueError(f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned")
         self._camera = DepthCamera(scene, config, model.planned.reaching(model.distance), ball_radius)
 
-    def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
+    def find(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
         """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
         ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
-        balls = [self._camera.find(pose, ball, noise) for pose in camera_poses(model, q)]
+        poses = enumerate(camera_poses(model, q))
+        balls = [self._camera.find(pose, ball, noise, number) for number, pose in poses]
         points = np.array([[NOWHERE if ball is None else ball.centre] for ball in balls])
         return points, np.array([[ball is not None] for ball in balls])
 
@@ -300,7 +357,7 @@ class SetupDetector(Detector[SetupModel]):
         """Take the cameras."""
         self._cameras = cameras
 
-    def measure(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
+    def measure(self, model: SetupModel, q: FloatArray, noise: ImageNoise) -> tuple[FloatArray, BoolArray]:
         """See `Detector.measure`."""
         points, found = self._cameras.find(model, q, noise)
         feature = model.setup.measure(points, model.optics)
@@ -341,7 +398,7 @@ def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
     if needs_depth(model.setup, model.optics):
         return SetupDetector(BallCameras(model, scene, config, robot.workspace.ball_radius))
-    return SetupDetector(MarkCameras(model, scene, config))
+    return SetupDetector(MarkCameras(model, scene, config, mark_radius(model, robot)))
 
 
 def needs_depth(setup: SensingSetup, optics: Optics) -> bool:
@@ -376,7 +433,12 @@ def depth_deviation(config: RenderedConfig, depth: npt.ArrayLike, camera: Pinhol
 
 
 def measure_depth(
-    config: RenderedConfig, depth: FloatArray, patch: Patch, camera: PinholeCamera, generator: np.random.Generator
+    config: RenderedConfig,
+    depth: FloatArray,
+    patch: Patch,
+    shape: tuple[int, int],
+    camera: PinholeCamera,
+    generator: np.random.Generator,
 ) -> FloatArray:
     """Return measured depths, (k,) m, of the k pixels of a patch; without noise nothing is drawn.
 
@@ -384,26 +446,27 @@ def measure_depth(
         config: model of the noise, its factor and the depth unit.
         depth: (k,) [m], true.
         patch: the pixels.
+        shape: height and width [px] of the window that the pixels are in, for all of which noise is drawn.
         camera: its intrinsics.
         generator: of the noise.
     """
     z = depth
     if config.depth_noise != "none":
-        noise = _unit_noise(config.depth_patch * camera.width / config.native_width, patch, generator)
-        z = z + config.sensing.noise_factor * depth_deviation(config, z, camera) * noise
+        noise = _unit_noise(config.depth_patch * camera.width / config.native_width, shape, generator)
+        deviation = config.sensing.noise_factor * depth_deviation(config, z, camera)
+        z = z + deviation * noise[patch.rows, patch.columns]
     if config.depth_quantisation > 0.0:
         z = np.round(z / config.depth_quantisation) * config.depth_quantisation
     return z
 
 
-def _unit_noise(side: float, patch: Patch, generator: np.random.Generator) -> FloatArray:
-    """Return noise of unit variance at pixels, (k,), that match by patches of `side` px; drawn on their box only."""
-    rows, columns = (index - index.min() for index in (patch.rows, patch.columns))
+def _unit_noise(side: float, shape: tuple[int, int], generator: np.random.Generator) -> FloatArray:
+    """Return noise of unit variance at all pixels of a window, (h, w), that match by patches of `side` px."""
     kernel = _patch_kernel(side)
-    margin = len(kernel) - 1
-    white = generator.standard_normal((int(rows.max()) + 1 + margin, int(columns.max()) + 1 + margin))
+    margin = len(kernel) // 2
+    white = generator.standard_normal((shape[0] + 2 * margin, shape[1] + 2 * margin))
     smooth = convolve1d(convolve1d(white, kernel, axis=0), kernel, axis=1)
-    return np.asarray(smooth[rows + margin // 2, columns + margin // 2])
+    return np.asarray(smooth[margin : margin + shape[0], margin : margin + shape[1]])
 
 
 @cache

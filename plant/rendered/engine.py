@@ -48,7 +48,7 @@ class Scene(ABC):
     def render(self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None) -> Image:
         """Return the image of a camera at X_BC (4, 4): colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
 
-        With a window only this part of the image, the same pixels as in all of it.
+        With a window only this part of the image; its pixels are those of the whole image, but for rounding.
         """
 
     @abstractmethod

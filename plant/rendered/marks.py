@@ -56,12 +56,13 @@ class Mark(NamedTuple):
     shares: FloatArray  # (k,), of each of them that the mark has
 
 
-def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | None]:
+def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...], corner: tuple[int, int] = (0, 0)) -> list[Mark | None]:
     """Return the mark of each colour, or None where it is not wholly visible.
 
     Args:
-        rgb: (h, w, 3 or 4).
+        rgb: (h, w, 3 or 4), an image or a window of it.
         colours: of the marks.
+        corner: row and column of the window's first pixel in the image, from which the marks' pixels are counted.
     """
     hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
     masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
@@ -74,7 +75,8 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | N
         if patch is None or whole is None or touched or not fills_ellipse(whole):
             found.append(None)
         else:
-            found.append(_with_shares(patch, whole, rgb, colours[number].paint))
+            mark = _with_shares(patch, whole, rgb, colours[number].paint)
+            found.append(mark._replace(rows=mark.rows + corner[0], columns=mark.columns + corner[1]))
     return found
 
 

@@ -177,7 +177,7 @@ class MujocoScene(Scene):
         mujoco.mjv_updateScene(self._model, self._data, self._options, None, self._view, kinds, self._drawn)
         for gl_camera in self._drawn.camera:
             _aim(gl_camera, camera, X_BC)
-        shape, context = (window.bottom - window.top, window.right - window.left), self._context
+        shape, context = window.shape, self._context
         part = (window.left, camera.height - window.bottom, *shape[::-1])
         rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
         with self._gl.as_current(), scissors(*part):

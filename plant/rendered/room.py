@@ -65,7 +65,7 @@ class Room:
         if model.mount == "fixed":
             self._draw_target(carried, model, -self.arm.tool)
             return {"arm.urdf": urdf.text(tree)}
-        radius, length = self._scale(model) * np.array(HOUSING)
+        radius, length = target_scale(model, self.robot) * np.array(HOUSING)
         for pose in model.cameras:
             lens = pose[:3, 3] - self.arm.tool
             urdf.draw_cylinder(carried, urdf.DARK_GREY, lens - length * pose[:3, 2], lens, radius)
@@ -75,14 +75,9 @@ class Room:
         urdf.add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
         return {"arm.urdf": urdf.text(tree), "target.urdf": urdf.text(body)}
 
-    def _scale(self, model: SetupModel) -> float:
-        """Return the scale of all lengths of a target and its cameras, over those of a UR5's bench."""
-        side = None if self.robot.camera is None else self.robot.camera.keys.target.side
-        return self.robot.workspace.scale if side is None or len(model.target) == 1 else side / (2.0 * HALF)
-
     def _draw_target(self, link: ET.Element, model: SetupModel, shift: FloatArray) -> None:
         """Draw ball or plate, the points of which are shifted by (3,) [m] into a link's frame."""
-        points, scale = model.target + shift, self._scale(model)
+        points, scale = model.target + shift, target_scale(model, self.robot)
         if len(points) == 1:
             urdf.draw_mesh(link, RED, urdf.BALL_MESH, self.robot.workspace.ball_radius)
             return
@@ -97,6 +92,19 @@ class Room:
             urdf.draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
             urdf.draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
             urdf.draw_cylinder(link, urdf.DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+
+
+def target_scale(model: SetupModel, robot: Robot) -> float:
+    """Return the scale of all lengths of a target and its cameras, over those of a UR5's bench."""
+    side = None if robot.camera is None else robot.camera.keys.target.side
+    return robot.workspace.scale if side is None or len(model.target) == 1 else side / (2.0 * HALF)
+
+
+def mark_radius(model: SetupModel, robot: Robot) -> float:
+    """Return the radius [m] of a target's ball, or of its discs."""
+    if len(model.target) == 1:
+        return robot.workspace.ball_radius
+    return DISC_RADIUS * target_scale(model, robot)
 
 
 @dataclass(frozen=True, eq=False)

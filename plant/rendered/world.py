@@ -7,7 +7,6 @@ the table, the floor or an obstacle ends the run. Features are measured by `serv
 Delay, latency and lost frames are those of `servobench.plant.bench.bench`.
 """
 
-import copy
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -21,7 +20,7 @@ from servobench.plant.contract.checks import FloatArray, as_array, fewest_parts
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.rendered.detectors import Generators, begin_noise, open_detector
+from servobench.plant.rendered.detectors import ImageNoise, open_detector
 from servobench.plant.rendered.drives import PHYSICS_STEP, DriveState
 from servobench.plant.rendered.engine import Engine, Machine, Overlap
 from servobench.plant.rendered.room import Room
@@ -77,7 +76,7 @@ class RenderedState:
     joints: DriveState  # angles, speeds and loops of the joints
     periods: int  # number of periods since the reset
     camera: FloatArray  # (4, 4), pose of the first camera
-    noise: Generators  # of the images
+    noise: ImageNoise  # noise of the next frame
 
 
 class RenderedWorld(World):
@@ -130,7 +129,7 @@ class RenderedWorld(World):
         Raises:
             Collision: the arm overlaps with itself or the room at the start.
         """
-        self._noise = begin_noise(seed)
+        self._noise = ImageNoise(seed)
         self.move_camera(self._camera)
         self._periods = 0
         angle = self._model.arm.joint_angle(self._start)
@@ -169,6 +168,7 @@ class RenderedWorld(World):
     def see(self) -> FloatArray | None:
         """Return the features as measured now, (m,); None if nothing is found."""
         feature, self._valid = self._detector.measure(self._model, self._joint_position(), self._noise)
+        self._noise = self._noise.next()
         return feature
 
     def visible(self) -> BoolArray | None:
@@ -181,14 +181,14 @@ class RenderedWorld(World):
 
     def save(self) -> RenderedState:
         """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
-        return RenderedState(self._joints, self._periods, self._model.camera, copy.deepcopy(self._noise))
+        return RenderedState(self._joints, self._periods, self._model.camera, self._noise)
 
     def restore(self, state: RenderedState) -> None:
         """See `Plant.restore`."""
         self._joints, self._periods = state.joints, state.periods
         self._scene.place(state.joints.angle)
         self.move_camera(state.camera)
-        self._noise = copy.deepcopy(state.noise)
+        self._noise = state.noise
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""

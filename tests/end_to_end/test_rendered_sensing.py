@@ -9,7 +9,7 @@ from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import detectors
 from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
-from servobench.plant.rendered.detectors import DepthCamera, begin_noise, measure_depth
+from servobench.plant.rendered.detectors import DepthCamera, ImageNoise, measure_depth
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.workspace import BALL_RADIUS
@@ -29,7 +29,7 @@ def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
         patch, tried = find_patch(rgba), tried + 1
         if patch is not None:
             true = camera.metric_depth(buffer[patch.rows, patch.columns])
-            depth = measure_depth(noise, true, patch, camera, rng)
+            depth = measure_depth(noise, true, patch, rgba.shape[:2], camera, rng)
             found = locate_ball(patch, depth, camera, BALL_RADIUS)
             if found is not None:
                 errors.append(found.centre - MODEL.to_camera(scene.ball_position()))
@@ -107,8 +107,14 @@ def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_bal
         if window is None:
             assert patch is None
             continue
-        for image, part in zip(images, scene.render(depth_camera.camera, X_BC, window), strict=True):
-            np.testing.assert_array_equal(window.cut(image), part)
+        colours, depths = scene.render(depth_camera.camera, X_BC, window)
+        other = (window.cut(images[0]) != colours).any(axis=-1)
+        assert np.count_nonzero(other) <= 1  # rounding moves an edge
+        np.testing.assert_allclose(depths[~other], window.cut(images[1])[~other], atol=2e-6)
+        if patch is not None:
+            part = find_patch(colours)
+            np.testing.assert_array_equal(part.rows + window.top, patch.rows)
+            np.testing.assert_array_equal(part.columns + window.left, patch.columns)
         if patch is not None:
             seen += 1
             margins = patch.rows.min() - window.top, patch.columns.min() - window.left
@@ -119,19 +125,17 @@ def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_bal
 
 def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeypatch):
     scene, camera, found = open_scene(scenery=False), PinholeCamera(), 0
-    depth_camera = DepthCamera(scene, BARE, camera, BALL_RADIUS)
-    noise, again = begin_noise(3), begin_noise(3)
+    depth_camera = DepthCamera(scene, IDEAL, camera, BALL_RADIUS)
+    noise = ImageNoise(3)
     for X_BC, _ in poses(scene, depth_camera, 20):
         one = depth_camera.find(X_BC, scene.ball_position(), noise)
         with monkeypatch.context() as patched:
             patched.setattr(detectors, "window_around", lambda *_: whole(camera))
-            other = depth_camera.find(X_BC, scene.ball_position(), again)
+            other = depth_camera.find(X_BC, scene.ball_position(), noise)
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             found += 1
-            np.testing.assert_array_equal(one.centre, other.centre)
-        states = [[part.bit_generator.state for part in each.values()] for each in (noise, again)]
-        assert states[0] == states[1]
+            np.testing.assert_allclose(one.centre, other.centre, atol=1e-5)
     assert 5 < found < 20
 
 

@@ -15,7 +15,7 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.detectors import begin_noise, open_detector
+from servobench.plant.rendered.detectors import ImageNoise, open_detector
 from servobench.plant.rendered.plants import load_engine
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
@@ -52,7 +52,7 @@ def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_
     model, rng = true_model(word), np.random.default_rng(5)
     scene = load_engine(engine).scene(Room(model.arm, scenery=False, robot=UR5, model=model))
     detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
-    noise = begin_noise(0)
+    noise = ImageNoise(0)
     while poses < 8:
         q = rng.uniform(UR5.workspace.lower, UR5.workspace.upper)
         true, _, in_view = model.observe(q)

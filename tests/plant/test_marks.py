@@ -7,7 +7,7 @@ import pytest
 
 from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
 from servobench.plant.cameras.registry import SETUPS
-from servobench.plant.rendered.detection import add_colour_noise
+from servobench.plant.rendered import detection
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
@@ -143,6 +143,7 @@ class Wall(Scene):
         rays = camera.rays(columns.ravel(), rows.ravel()).reshape(camera.height, camera.width, 3)
         image = np.full((camera.height, camera.width, 3), 200, dtype=np.uint8)
         image[np.linalg.norm(rays * self.centre[2] - self.centre, axis=-1) <= self.radius] = paint(1)
+        image = (window or detection.whole(camera)).cut(image)
         return image, np.zeros(image.shape[:2])
 
     def place(self, theta):
@@ -159,20 +160,28 @@ class Wall(Scene):
     ],
 )
 def test_a_lens_shows_a_point_where_its_optics_project_it(camera, optics, centre):
-    image = Lens(camera, optics, 0).render(Wall(centre, 0.03), np.eye(4))
+    lens = Lens(camera, optics, 0)
+    wall = Wall(centre, 0.03)
+    image = lens.render(wall, np.eye(4))
     assert image.shape == (camera.height, camera.width, 3)
     (mark,) = find_marks(image, MARK_COLOURS[1:2])
     true = project(np.array(centre)[None, None], optics)[0, 0]
     assert np.linalg.norm(disc_centre(mark, camera) - true) < 0.2
+    view = lens.view(np.array([centre]), wall.radius)
+    cut = lens.render(wall, np.eye(4), view)
+    assert cut.shape[:2] == view.part.shape < image.shape[:2]
+    (again,) = find_marks(cut, MARK_COLOURS[1:2], (view.part.top, view.part.left))
+    np.testing.assert_array_equal(again.rows, mark.rows)
+    np.testing.assert_array_equal(again.columns, mark.columns)
+    np.testing.assert_allclose(disc_centre(again, camera), disc_centre(mark, camera), atol=0.01)
 
 
-def test_noise_around_a_mark_brings_no_more_of_it_around_another():
-    image, hues = blank(), [colour.hues for colour in MARK_COLOURS]
-    for mark in range(4):
-        image[115:125, 55 + 60 * mark : 65 + 60 * mark] = paint(mark)
-    changed = (add_colour_noise(image, 50.0, np.random.default_rng(0), hues) != image).any(axis=-1)
-    assert 1200 < changed.sum() <= 4 * 18**2  # boxes of 10 px with a margin of 4 px
-    assert not changed[:, [90, 150, 210]].any()
+def test_a_point_that_only_the_ideal_image_is_wide_enough_for_is_not_in_view():
+    lens = Lens(CAMERA, BENT, 0)
+    across = lens._ideal.width / 2 / lens._ideal.focal
+    outside = np.array([[0.98 * across, 0.0, 1.0]])
+    assert detection.window_around_all(outside, 0.001, lens._ideal) is not None
+    assert lens.view(outside, 0.001) is None
 
 
 def test_a_camera_as_planned_needs_no_lens():
