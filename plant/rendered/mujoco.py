@@ -301,6 +301,8 @@ class MujocoSimulation(Simulation):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
+        if not data.ncon:
+            return
         for pair in data.contact.geom[data.contact.dist <= -MIN_OVERLAP].tolist():
             first, second = sorted(bodies[part] for part in pair)
             link = min(second - 1, self._n)  # MuJoCo counts the world as 0, the base as 1
