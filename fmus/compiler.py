@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 # No fused multiply-add, so that every platform rounds alike; only the FMI functions are visible.
-CODE = ("-std=c11", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared")
+CODE = ("-std=c11", "-O3", "-ffp-contract=off", "-fvisibility=hidden", "-shared")
 COMPILERS = ("cc", "gcc", "clang")
 
 
