@@ -30,6 +30,9 @@ from servobench.harness.batch.container import memory_limit, processor_limit
 
 LINUX: Final = sys.platform == "linux"  # of the other systems, macOS is provided for
 SET_DEATH_SIGNAL, ADOPT_ORPHANS = 1, 36  # of prctl(2)
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+KEPT_MEMORY: Final = 2**30  # [bytes] of freed memory that a worker keeps
+LARGEST_BLOCK: Final = 2**25  # [bytes] from which on a block has pages of its own; glibc takes no larger threshold
 FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
 FOREIGN_SHARE: Final = 0.8  # share of the memory for all concurrent runs of foreign code
 LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least, on a machine that is no container
@@ -124,6 +127,20 @@ def forget_tracker() -> None:
 def adopt_orphans() -> None:
     """Become the parent of each descendant whose parent ends."""
     _prctl(ADOPT_ORPHANS, 1)
+
+
+def keep_freed_memory() -> None:
+    """Let this process and its copies keep the memory that they free, where their C library is glibc.
+
+    A block of runs needs the same arrays in each period. By default large ones go back to the system when they are
+    freed, and the next ones begin with a fault for each page.
+    """
+    if not LINUX:
+        return
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(MMAP_THRESHOLD, LARGEST_BLOCK)
+        set_option(TRIM_THRESHOLD, KEPT_MEMORY)
 
 
 def _stand_over(child: int) -> NoReturn:

@@ -313,6 +313,7 @@ def keep_guard(link: Connection, limits: Limits, inherited: Sequence[Connection]
         each.close()
     signal.signal(signal.SIGTERM, lambda *_: link.close())  # no exception, which a destructor would swallow
     processes.adopt_orphans()
+    processes.keep_freed_memory()
     gc.freeze()  # so that runners go on sharing the memory of all imports
     gc.set_threshold(700)  # of Python 3.11; a copy of the command has a larger one, under which memory piles up
     guard = _Guard(link, limits)
